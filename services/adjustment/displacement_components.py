@@ -2,11 +2,12 @@
 
 The displacement of each coordinate is a sum of Gaussian processes, the components. Those of images that
 were scanned depend on the line or the sample: smooth ones (bow, slow attitude, distortion of the
-optics), narrow bands (jitter) and steps (lost or repeated lines). Those of ortho-images depend on both,
-and are smooth (terrain, seams of a mosaic). A component is added as long as the residuals show one
-that chance does not explain and that predicts blocks of lines or samples which were held out. Kernels
-and variances are those of the largest restricted likelihood (Patterson and Thompson, 1971); estimate and
-covariance are those of universal kriging. Where the pixels show a break, there is a step of any size.
+optics), narrow bands (jitter) and steps (lost or repeated lines, seams between detectors). Those of
+ortho-images depend on both, and are smooth (terrain, seams of a mosaic). A component is added as long as
+the residuals show one that chance does not explain and that predicts blocks of lines or samples which
+were held out. Kernels and variances are those of the largest restricted likelihood (Patterson and
+Thompson, 1971); estimate and covariance are those of universal kriging. Where the pixels show a break,
+there is a step of any size.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,8 +23,11 @@ from services.types import Array, IntArray
 Along = Literal["lines", "samples", "image"]
 """Of which a displacement is a function: of the line, of the sample, of both."""
 _AXES: dict[Along, slice] = {"lines": slice(0, 1), "samples": slice(1, 2), "image": slice(0, 2)}
-_OF_SCANNED: dict[Along, tuple[Family, ...]] = {"lines": ("lines", "steps"), "samples": ("samples",)}
-_OF_ORTHO: dict[Along, tuple[Family, ...]] = {"image": ("lines", "steps", "samples", "image")}
+_OF_SCANNED: dict[Along, tuple[Family, ...]] = {
+    "lines": ("lines", "steps"),
+    "samples": ("samples", "seams"),
+}
+_OF_ORTHO: dict[Along, tuple[Family, ...]] = {"image": (*ALONG_AXES, "image")}
 """Structures that components of images that were scanned, and of ortho-images, may explain."""
 
 Kind = Literal["smooth", "period", "step", "break", "quadratic", "cubic"]
@@ -54,7 +58,7 @@ _LENGTHS: dict[Along, tuple[float, ...]] = {
 }
 """Correlation lengths of smooth components, extents of the points along the axis.
 
-Seams between detectors are shorter than what optics do, and no smooth displacement."""
+Along the samples, what is shorter than optics do is a seam between detectors."""
 _COHERENCE = (0.15, 0.4, 2.0)
 """Lengths over which a narrow band keeps its phase, the same."""
 _LEAST_SEEN = 0.4
@@ -97,7 +101,7 @@ class Component:
 
     @property
     def is_step(self) -> bool:
-        """Whether it displaces all that lies behind a line alike."""
+        """Whether it displaces all that lies behind a line, or sample, alike."""
         return self.kind in ("step", "break")
 
     def polynomial(self, line_sample: Array) -> Array:
@@ -110,7 +114,8 @@ class Component:
         if self.kind in BENDS:
             return self.polynomial(line_sample) ** 2
         if self.is_step:
-            return np.clip((line_sample[..., 0] - self.at_px) / self.length_px, 0.0, 1.0)
+            behind_px = line_sample[..., self.axes.start] - self.at_px
+            return np.clip(behind_px / self.length_px, 0.0, 1.0)
         return np.ones(line_sample.shape[:-1])
 
     def correlation(self, first: Array, second: Array) -> Array:
@@ -314,8 +319,8 @@ def _candidates(
         shown = [one for one in found if one.family in families]
         if min(one.chance for one in shown) <= MAX_CHANCE:
             candidates += _smooth(residuals, along)
-            if along == "lines":
-                candidates += _sharp(residuals, shown)
+            if along != "image":
+                candidates += _sharp(residuals, shown, along)
     return candidates
 
 
@@ -332,15 +337,15 @@ def _smooth(residuals: Residuals, along: Along) -> list[Component]:
     ]
 
 
-def _sharp(residuals: Residuals, found: Sequence[Structure]) -> list[Component]:
-    """Jitter and steps along the lines, of unit variance, that may explain a structure."""
-    position = residuals.line_sample[:, 0]
+def _sharp(residuals: Residuals, found: Sequence[Structure], along: Along) -> list[Component]:
+    """Jitter along the lines, and steps, of unit variance, that may explain a structure."""
+    position = residuals.line_sample[:, _AXES[along].start]
     extent = max(float(np.ptp(position)), 1e-9)
     one = np.ones(2)
     side = residuals.chip_side_px
     candidates = []
     for structure in found:
-        if structure.shape == "period":
+        if structure.shape == "period" and along == "lines":
             frequency = 1.0 / structure.at + np.arange(-_FINE // 2, _FINE // 2 + 1) / (_FINE * extent)
             periods = 1.0 / frequency[frequency > 0.25 / extent]
             phase = 2.0 * np.pi * position / periods[:, None]
@@ -355,7 +360,7 @@ def _sharp(residuals: Residuals, found: Sequence[Structure]) -> list[Component]:
             after = int(np.searchsorted(ordered, structure.at))
             start = float(ordered[after - 1])
             width = float(ordered[after]) - start
-            candidates.append(Component("step", width, start, one))
+            candidates.append(Component("step", width, start, one, along=along))
     return candidates
 
 
@@ -420,5 +425,8 @@ class _System:
         evidence = peak + float(np.log(weight.mean()))
         if component is None:
             return _Judged(None, evidence)
+        if component.kind == "step":
+            # The likeliest of the gaps between neighbours: any other was as likely before.
+            evidence -= float(np.log(len(self.place)))
         variance = np.array([_RATIOS[first], _RATIOS[second]]) * self.unit_px2
         return _Judged(replace(component, variance_px2=variance), evidence)

@@ -21,9 +21,10 @@ from scipy.special import fdtrc
 
 from services.types import Array
 
-Family = Literal["lines", "samples", "steps", "image", "height", "chips"]
-"""What residuals may depend on; "steps" are those along the lines, "chips" motion within chips."""
-ALONG_AXES: tuple[Family, ...] = ("lines", "steps", "samples")
+Family = Literal["lines", "steps", "samples", "seams", "image", "height", "chips"]
+"""What residuals may depend on; "steps" are along the lines, "seams" steps along the samples, "chips"
+motion within chips."""
+ALONG_AXES: tuple[Family, ...] = ("lines", "steps", "samples", "seams")
 OTHERWISE: tuple[Family, ...] = ("image", "height")
 _OF_PLACES: tuple[Family, ...] = (*ALONG_AXES, "image")
 """Families that say how far off a place is; what depends on height is another model's."""
@@ -58,7 +59,7 @@ class Structure:
         family: of the shape.
         chance: probability, at most, that independent errors show some shape of the family as clearly.
         shape: "quadratic", "cubic", "period", "step", "wave" or "slope"; "" where nothing was tried.
-        at: period in pixels, or line of a step; NaN for other shapes.
+        at: period in pixels, or line or sample of a step; NaN for other shapes.
         size_px: (2,) of the shape at the points, line and sample, root mean square.
         largest_px: longest displacement of a point by the shape, from their mean.
         slope_px: (2,) pixels per metre of height, of a slope; NaN for other shapes.
@@ -265,8 +266,8 @@ def _shapes(residuals: Residuals, family: Family) -> list[_Shapes]:
         return [(("slope",), (np.nan,), height)]
     if family == "image":
         return [_waves(residuals.line_sample)]
-    position = residuals.line_sample[:, 1 if family == "samples" else 0]
-    if family == "steps":
+    position = residuals.line_sample[:, 1 if family in ("samples", "seams") else 0]
+    if family in ("steps", "seams"):
         return [_steps(position)]
     most = int(min(_MOST_CYCLES[family], max(2 * len(position), _LEAST_POINTS)))
     return [_polynomials(position), _periods(position, residuals.chip_side_px, most)]

@@ -135,11 +135,17 @@ _DESCRIPTIONS = {
         "As along the lines: seams between detectors and distortions of the optics show here. The limit "
         "is half of the predicted CE90 for good, twice it for usable.",
     ),
+    "steps_along_samples": _Description(
+        "Steps along the samples",
+        "px",
+        2,
+        "As along the samples, for a step at some sample: a seam between two detectors.",
+    ),
     "structure_in_image": _Description(
         "Residuals over the image",
         "px",
         2,
-        "The same for waves in two dimensions.",
+        "As along the samples, for waves in two dimensions.",
     ),
     "structure_against_height": _Description(
         "Residuals against height",
@@ -171,6 +177,12 @@ _DESCRIPTIONS = {
         "Lines between which hardly any of the points tried agree with the scene, fewer than chance "
         "explains (binomial, times the number of intervals, 0.01), as a share of all lines. Points "
         "under clouds and where pixels are missing do not count. Usable up to 10 %.",
+    ),
+    "missed_along_samples": _Description(
+        "Samples whose points do not agree",
+        "%",
+        0,
+        "The same for samples: detectors out of place show here.",
     ),
     "points_elsewhere": _Description(
         "Points that agree elsewhere",

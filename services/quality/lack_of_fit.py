@@ -2,21 +2,24 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
+import shapely
 from scipy.spatial import KDTree
 from scipy.special import comb
 
 from services.adjustment.broken_image import FEWEST_IN_PART, held_parts, part_of_line
 from services.adjustment.structure import Family, Structure
 from services.quality.criteria import Criterion, Grade, at_most
-from services.quality.missed_lines import UNFOUND, missed_lines
+from services.quality.missed_along import UNFOUND, missed_along
 from services.types import Array, BoolArray, IntArray
 
 _CRITERIA: dict[Family, str] = {
     "lines": "structure_along_lines",
     "steps": "steps_along_lines",
     "samples": "structure_along_samples",
+    "seams": "steps_along_samples",
     "image": "structure_in_image",
     "height": "structure_against_height",
     "chips": "structure_within_chips",
@@ -33,13 +36,26 @@ _WITHIN = 0.15
 or repeated rather than ground moved."""
 _ALONG = 0.1
 """Displacement along the samples over that along the lines, up to which lines alone were displaced."""
+_MOVED = (
+    "others beside them do not: ground that moved (a landslide, a quarry, ice), or a part of another "
+    "image"
+)
 _ENOUGH = 4
 """Points that agree elsewhere, from which on one may do so by chance."""
 _MISSED_PERCENT = 10.0
-"""Share of the lines whose points do not agree, beyond which the scene is not usable."""
+"""Share of the lines, or samples, whose points do not agree, beyond which the scene is not usable."""
+_WHY_MISSED = {
+    "lines": "lines were lost or repeated, the sensor swung by more than the search reaches",
+    "samples": "a detector is out of place, an image was put together from parts",
+}
 _LARGE_PART = 0.4
 """Share of the image to which points that agree elsewhere are nearest, beyond which neither place is the
 scene's."""
+_AMONG = 0.3
+"""Share of the active points between points that agree elsewhere, beyond which the image has two places
+rather than a part that moved."""
+_CHANCE_OF_SAMPLES = 0.01
+"""Of points drawn at random being those of whole samples, at most, to be taken for these."""
 _NODES = 30
 """Places along each side of the image at which the nearest point is sought."""
 
@@ -132,47 +148,51 @@ def breaks_criterion(breaks: IntArray, line: Array, followed: bool, lines: int) 
 
 
 def missed_criterion(
-    line: Array, active: BoolArray, reason: np.ndarray, lines: int, shown: BoolArray | None = None
+    along: Literal["lines", "samples"],
+    position: Array,
+    active: BoolArray,
+    reason: np.ndarray,
+    size: int,
+    *,
+    shown: BoolArray | None = None,
 ) -> Criterion:
-    """The criterion on lines whose points do not agree, where those of other lines do.
+    """The criterion on lines, or samples, whose points do not agree, where those of others do.
 
     Args:
-        line: (n,) where the points are expected.
+        along: of what.
+        position: (n,) line or sample where the points are expected.
         active: (n,) those that the adjustment uses.
         reason: (n,) why others are not.
-        lines: of the image.
+        size: lines or samples of the image.
         shown: (n,) points whose chips no break of the image cuts; all when None.
     """
+    name = f"missed_along_{along}"
     tried = active | np.isin(reason, (*UNFOUND, "deactivated"))
     if shown is not None:
         tried &= shown | active
-    missed = missed_lines(line, active, tried)
+    missed = missed_along(position, active, tried)
     if not missed.any():
-        return at_most("missed_along_lines", 0.0, 0.0, "good")
+        return at_most(name, 0.0, 0.0, "good")
     beside = tried & ~missed
-    first, last = float(line[missed].min()), float(line[missed].max())
-    percent = 100.0 * _share_of_lines(line, missed, beside, lines)
+    first, last = float(position[missed].min()), float(position[missed].max())
+    percent = 100.0 * _missed_share(position, missed, beside, size)
     severe = percent > _MISSED_PERCENT
     criterion = at_most(
-        "missed_along_lines",
-        percent,
-        _MISSED_PERCENT if severe else 0.0,
-        "usable" if severe else "good",
+        name, percent, _MISSED_PERCENT if severe else 0.0, "usable" if severe else "good"
     )
     seen = (
-        f"of {int(missed.sum())} points tried between lines {first:.0f} and {last:.0f}, "
+        f"of {int(missed.sum())} points tried between {along} {first:.0f} and {last:.0f}, "
         f"{int((missed & active).sum())} agree with the scene, of {int(beside.sum())} others "
-        f"{int((beside & active).sum())}: lines were lost or repeated, the sensor swung by more than "
-        "the search reaches, or what these lines show has changed"
+        f"{int((beside & active).sum())}: {_WHY_MISSED[along]}, or what these {along} show has changed"
     )
     return replace(criterion, note=seen)
 
 
-def _share_of_lines(line: Array, missed: BoolArray, others: BoolArray, lines: int) -> float:
-    """Share of the lines that lie with missed points between the same two others, or the border."""
-    edges = np.concatenate([[0.0], np.sort(np.clip(line[others], 0.0, lines)), [float(lines)]])
-    gap = np.clip(np.searchsorted(edges, line[missed]), 1, len(edges) - 1)
-    return float(np.diff(edges)[np.unique(gap) - 1].sum() / lines)
+def _missed_share(position: Array, missed: BoolArray, others: BoolArray, size: int) -> float:
+    """Share of the image that lies with missed points between the same two others, or the border."""
+    edges = np.concatenate([[0.0], np.sort(np.clip(position[others], 0.0, size)), [float(size)]])
+    gap = np.clip(np.searchsorted(edges, position[missed]), 1, len(edges) - 1)
+    return float(np.diff(edges)[np.unique(gap) - 1].sum() / size)
 
 
 def against_height(elsewhere: Elsewhere | None, sight: Array, predicted_px: float) -> Criterion | None:
@@ -208,28 +228,44 @@ def elsewhere_criterion(
     """
     if elsewhere is None or elsewhere.slope_px is not None:
         return at_most("points_elsewhere", 0, 0, "good")
-    line = line_sample[elsewhere.rows, 0]
+    some, others = line_sample[elsewhere.rows], line_sample[active]
+    line = some[:, 0]
     first, last = float(line.min()), float(line.max())
-    whole_lines = _belong_to_whole_lines(line, line_sample[active, 0], elsewhere.displacement_px)
     moved = (
         f"{len(line)} points of lines {first:.0f} to {last:.0f} agree on a place "
         f"{np.hypot(*elsewhere.displacement_px):.1f} px ({elsewhere.displacement_m:.1f} m) away "
         f"({elsewhere.displacement_px[0]:+.1f} lines, {elsewhere.displacement_px[1]:+.1f} samples), "
         f"of which chance makes {elsewhere.false_alarms:.1g}"
     )
-    looks = (
-        "hardly any others lie between these lines: lines of the image were lost or repeated, or belong "
-        "to another image"
-        if whole_lines
-        else "others beside them do not: ground that moved (a landslide, a quarry, ice), or a part of "
-        "another image"
-    )
-    part = _nearest_share(line_sample[elsewhere.rows], line_sample[active], shape)
-    large = part > _LARGE_PART
-    if large and not whole_lines:
-        looks += f"; they are nearest to {part:.0%} of the image, so that neither place is the scene's"
-    criterion = at_most("points_elsewhere", len(line), 0, "usable" if whole_lines or large else "good")
-    return replace(criterion, note=f"{moved}; {looks}")
+    broken = _broken_by(some, others, elsewhere.displacement_px, shape)
+    criterion = at_most("points_elsewhere", len(line), 0, "usable" if broken else "good")
+    return replace(criterion, note=f"{moved}; {broken or _MOVED}")
+
+
+def _broken_by(some: Array, others: Array, displacement_px: Array, shape: tuple[int, int]) -> str:
+    """How points (n, 2) that agree elsewhere than others (m, 2) break an image; "" by moved ground."""
+    if _belong_to_whole_lines(some[:, 0], others[:, 0], displacement_px):
+        return (
+            "hardly any others lie between these lines: lines of the image were lost or repeated, or "
+            "belong to another image"
+        )
+    sample, samples_of_others = some[:, 1], others[:, 1]
+    by_chance = chance_of_whole_lines(sample, samples_of_others)
+    if are_whole_lines(sample, samples_of_others) and by_chance <= _CHANCE_OF_SAMPLES:
+        return (
+            f"hardly any others lie between their samples, {sample.min():.0f} to {sample.max():.0f}: a "
+            "detector is out of place, or the image was put together from parts"
+        )
+    among = float(np.mean(shapely.contains_xy(shapely.MultiPoint(some).convex_hull, others)))
+    if among > _AMONG:
+        return (
+            f"{among:.0%} of the others lie between them: detectors that alternate, or an image put "
+            "together from parts, so that neither place is the scene's"
+        )
+    part = _nearest_share(some, others, shape)
+    if part > _LARGE_PART:
+        return f"{_MOVED}; they are nearest to {part:.0%} of the image: neither place is the scene's"
+    return ""
 
 
 def _nearest_share(some: Array, others: Array, shape: tuple[int, int]) -> float:
@@ -254,7 +290,10 @@ def _belong_to_whole_lines(line: Array, others: Array, displacement_px: Array) -
 
 
 def chance_of_whole_lines(line: Array, others: Array) -> float:
-    """Chance that n of all n + m points, drawn at random, are those of whole lines, at most."""
+    """Chance that n of all n + m points, drawn at random, are those of whole lines, at most.
+
+    The same is that of whole samples, and so for `are_whole_lines`.
+    """
     places = int(len(line) + max(1.0, _WITHIN * len(line)))
     total = len(line) + len(others)
     if places >= total:
@@ -282,7 +321,10 @@ def _looks_like(structure: Structure, sight: Array, shape: tuple[int, int]) -> s
             "the predicted accuracy holds it"
         )
     if structure.shape == "step":
-        return f"a step of {size} at line {structure.at:.0f}: lines that were lost or repeated"
+        where, cause = "line", "lines that were lost or repeated"
+        if structure.family == "seams":
+            where, cause = "sample", "a seam between detectors"
+        return f"a step of {size} at {where} {structure.at:.0f}: {cause}"
     if structure.family == "image":
         return (
             f"neighbours are displaced together by {size}: relief that is not in the model, or terrain"

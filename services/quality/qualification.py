@@ -354,8 +354,14 @@ def _of_fit(scene: AdjustedScene, predicted_px: float) -> list[Criterion]:
         *structures,
         *_behind_breaks(scene),
         missed_criterion(
-            expected[:, 0], measures.active, measures.reason, scene.shape[0], _whole(scene, expected)
+            "lines",
+            expected[:, 0],
+            measures.active,
+            measures.reason,
+            scene.shape[0],
+            shown=_whole(scene, expected),
         ),
+        missed_criterion("samples", expected[:, 1], measures.active, measures.reason, scene.shape[1]),
         elsewhere_criterion(scene.elsewhere, expected, measures.active, scene.shape),
     ]
 

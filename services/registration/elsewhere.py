@@ -15,7 +15,7 @@ from services.matching.control_points import ChipSearch, PointMatches, match_poi
 from services.matching.height_consensus import height_consensus
 from services.matching.predict import spread_over_image
 from services.quality.lack_of_fit import Elsewhere, are_whole_lines, chance_of_whole_lines
-from services.quality.missed_lines import UNFOUND
+from services.quality.missed_along import UNFOUND
 from services.registration.context import PointContext, Prediction
 from services.registration.search import (
     FIRST_TOLERANCE_PX,

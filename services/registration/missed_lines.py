@@ -11,7 +11,7 @@ import numpy as np
 
 from services.adjustment.image_correction import SceneAdjustment
 from services.matching.control_points import ChipSearch, match_points, with_matches
-from services.quality.missed_lines import UNFOUND, missed_lines
+from services.quality.missed_along import UNFOUND, missed_along
 from services.registration.context import PointContext, Prediction
 from services.registration.search import Search, adjust_search, select_inliers
 
@@ -36,7 +36,7 @@ def search_missed_lines(
     line = prediction.model.project(search.points.lon_lat_h)[:, 0]
     reason = search.matches.reason
     unfound = np.isin(reason, UNFOUND)
-    missed = missed_lines(line, adjustment.active, unfound | (reason == ""))
+    missed = missed_along(line, adjustment.active, unfound | (reason == ""))
     rows = np.flatnonzero(missed & unfound)
     rows = rows[:: -(-len(rows) // _MOST) or 1]
     if len(rows) < _FEWEST:

@@ -12,10 +12,10 @@ SHAPE = (4000, 3000)
 PREDICTED_PX = 1.0
 
 
-def judged(family: Family, largest_px: float, chance: float = 1e-9) -> Criterion:
+def judged(family: Family, largest_px: float, chance: float = 1e-9, shape: str = "period") -> Criterion:
     """The criterion on a structure whose largest displacement is this many times the predicted CE90."""
     size_px = np.full(2, largest_px / 2.0)
-    structure = Structure(family, chance, "period", 800.0, size_px, largest_px, np.array([0.02, 0.0]))
+    structure = Structure(family, chance, shape, 800.0, size_px, largest_px, np.array([0.02, 0.0]))
     (criterion,) = structure_criteria([structure], SIGHT, SHAPE, PREDICTED_PX)
     return criterion
 
@@ -25,6 +25,7 @@ def judged(family: Family, largest_px: float, chance: float = 1e-9) -> Criterion
     [
         ("lines", None, 0.1),
         ("steps", None, 0.1),
+        ("seams", 0.5, 2.0),
         ("height", None, 0.5),
         ("samples", 0.5, 2.0),
         ("image", 0.5, 2.0),
@@ -44,7 +45,7 @@ def test_the_size_of_a_structure_limits_the_verdict(
         assert between.needed_for == "good"
 
 
-@pytest.mark.parametrize("family", ["lines", "steps", "samples", "image", "height", "chips"])
+@pytest.mark.parametrize("family", ["lines", "steps", "samples", "seams", "image", "height", "chips"])
 def test_what_chance_explains_is_not_named_however_large(family: Family) -> None:
     criterion = judged(family, 50.0, chance=1e-3)
     assert criterion.met
@@ -62,6 +63,17 @@ def test_what_chance_explains_is_not_named_however_large(family: Family) -> None
 )
 def test_a_structure_says_what_it_looks_like(family: Family, words: str) -> None:
     assert words in judged(family, 5.0).note
+
+
+@pytest.mark.parametrize(
+    ("family", "words"),
+    [
+        ("steps", "at line 800: lines that were lost"),
+        ("seams", "at sample 800: a seam between detectors"),
+    ],
+)
+def test_a_step_says_where_it_is_and_what_it_looks_like(family: Family, words: str) -> None:
+    assert words in judged(family, 5.0, shape="step").note
 
 
 LINES = 2000

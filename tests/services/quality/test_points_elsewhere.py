@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from services.quality.criteria import Criterion
 from services.quality.lack_of_fit import (
     Elsewhere,
     are_whole_lines,
@@ -14,11 +15,11 @@ from services.quality.lack_of_fit import (
 def judged(line: np.ndarray, others: np.ndarray, displacement_px: tuple[float, float]) -> str:
     """What a scene cannot be whose points of these lines lie elsewhere."""
     elsewhere = Elsewhere(np.arange(len(line)), np.array(displacement_px), 10.0, 1e-5)
-    line_sample = np.column_stack(
-        [np.concatenate([line, others]), np.full(len(line) + len(others), 5.0)]
-    )
+    rng = np.random.default_rng(3)
+    sample = np.concatenate([rng.uniform(350.0, 650.0, len(line)), rng.uniform(0.0, 999.0, len(others))])
+    line_sample = np.column_stack([np.concatenate([line, others]), sample])
     active = np.arange(len(line_sample)) >= len(line)
-    criterion = elsewhere_criterion(elsewhere, line_sample, active, (2000, 10))
+    criterion = elsewhere_criterion(elsewhere, line_sample, active, (2000, 1000))
     assert not criterion.met
     return criterion.needed_for
 
@@ -74,3 +75,37 @@ def test_points_drawn_at_random_are_seldom_of_whole_lines(n: int, m: int) -> Non
     stated = chance_of_whole_lines(np.arange(float(n)), np.arange(float(m)))
     assert seen / draws <= stated + 3.0 * np.sqrt(stated / draws)
     assert seen / draws >= stated / 4.0
+
+
+def of_detectors(elsewhere: np.ndarray, seed: int) -> Criterion:
+    """The criterion on points of some detectors of eight that lie elsewhere, of points all over."""
+    line_sample = np.random.default_rng(seed).uniform(0.0, 999.0, (120, 2))
+    beside = np.isin(line_sample[:, 1] // 125, elsewhere)
+    group = Elsewhere(np.flatnonzero(beside), np.array([4.0, -6.0]), 5.0, 1e-9)
+    return elsewhere_criterion(group, line_sample, ~beside, (1000, 1000))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_detector_out_of_place_makes_a_scene_unusable_and_is_named(seed: int) -> None:
+    criterion = of_detectors(np.array([3]), seed)
+    assert (criterion.met, criterion.needed_for) == (False, "usable")
+    assert "a detector is out of place" in criterion.note
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_detectors_that_alternate_leave_no_place_that_is_the_scenes(seed: int) -> None:
+    criterion = of_detectors(np.array([1, 4, 6]), seed)
+    assert (criterion.met, criterion.needed_for) == (False, "usable")
+    assert "detectors that alternate" in criterion.note
+
+
+def test_a_round_area_that_moved_is_neither() -> None:
+    rng = np.random.default_rng(9)
+    for _ in range(50):
+        line_sample = rng.uniform(0.0, 999.0, (120, 2))
+        centre = rng.uniform(200.0, 800.0, 2)
+        moved = np.hypot(*(line_sample - centre).T) < 180.0
+        if moved.sum() >= 4:
+            group = Elsewhere(np.flatnonzero(moved), np.array([4.0, -6.0]), 5.0, 1e-9)
+            criterion = elsewhere_criterion(group, line_sample, ~moved, (1000, 1000))
+            assert criterion.needed_for == "good", criterion.note

@@ -1,7 +1,8 @@
-"""Lines of an image whose points do not agree with the rest, where those of other lines do.
+"""Lines or samples of an image whose points do not agree with the rest, where those of others do.
 
 A scanner takes all samples of a line at once: where it jumped, or swung by more than a search reaches,
-whole lines are lost to the adjustment. What hides points hides them here and there.
+whole lines are lost to the adjustment. A detector takes the same samples of all lines: where it is out
+of place, these are lost. What hides points hides them here and there.
 """
 
 import numpy as np
@@ -17,25 +18,25 @@ _FEWEST = 4
 _MOST_ENDS = 400
 """Points at which intervals begin, and at which they end: dense references have thousands."""
 _HARDLY_ANY = 0.1
-"""Share of the points of missed lines that agree, over that of all, at most."""
+"""Share of the missed points that agree, over that of all, at most."""
 
 
-def missed_lines(line: Array, agrees: BoolArray, tried: BoolArray) -> BoolArray:
-    """Points (n,) of lines where fewer agree than chance explains.
+def missed_along(position: Array, agrees: BoolArray, tried: BoolArray) -> BoolArray:
+    """Points (n,) of lines, or of samples, where fewer agree than chance explains.
 
-    The intervals of lines are tried that begin and end with points which do not agree. The chance of one
+    The intervals are tried that begin and end with points which do not agree. The chance of one
     is binomial, times their number, at most 0.01; random orders of the points of real scenes fall below
     this in about one of a thousand cases, because intervals overlap.
 
     Args:
-        line: (n,) where the points are expected.
+        position: (n,) line or sample where the points are expected.
         agrees: (n,) with the scene.
         tried: (n,) those that the scene may show.
     """
-    missed = np.zeros(len(line), dtype=bool)
+    missed = np.zeros(len(position), dtype=bool)
     for _ in range(_MOST_GAPS):
         rows = np.flatnonzero(tried & ~missed)
-        rows = rows[np.argsort(line[rows], kind="stable")]
+        rows = rows[np.argsort(position[rows], kind="stable")]
         of_interval = _least_likely_interval(agrees[rows])
         if not len(of_interval):
             break

@@ -1,10 +1,10 @@
-"""Lines whose points do not agree: seen where a band is lost, not where points fail here and there."""
+"""Lines and samples whose points do not agree: seen where a band is lost, not where some points fail."""
 
 import numpy as np
 import pytest
 
 from services.quality.lack_of_fit import missed_criterion
-from services.quality.missed_lines import missed_lines
+from services.quality.missed_along import missed_along
 
 LINES = 2000
 
@@ -20,7 +20,7 @@ def test_points_that_fail_at_random_accuse_no_lines(share: float, n: int) -> Non
     accused = 0
     for _ in range(500):
         line = places(rng, n)
-        accused += missed_lines(line, rng.random(n) < share, np.ones(n, dtype=bool)).any()
+        accused += missed_along(line, rng.random(n) < share, np.ones(n, dtype=bool)).any()
     assert accused <= 5  # one in a hundred
 
 
@@ -31,7 +31,7 @@ def test_a_band_of_lost_lines_is_found_with_its_borders(first: float) -> None:
         line = places(rng, 120)
         lost = (line >= first) & (line < first + 400.0)
         agrees = (rng.random(120) < 0.7) & ~lost
-        missed = missed_lines(line, agrees, np.ones(120, dtype=bool))
+        missed = missed_along(line, agrees, np.ones(120, dtype=bool))
         assert missed[lost].all()
         # Points that fail on their own beside the band are taken with it, a few lines of them.
         assert (missed & ~lost).sum() <= 8
@@ -41,7 +41,7 @@ def test_two_bands_are_both_found() -> None:
     rng = np.random.default_rng(12)
     line = places(rng, 200)
     lost = ((line > 300.0) & (line < 600.0)) | (line > 1700.0)
-    missed = missed_lines(line, ~lost & (rng.random(200) < 0.8), np.ones(200, dtype=bool))
+    missed = missed_along(line, ~lost & (rng.random(200) < 0.8), np.ones(200, dtype=bool))
     assert missed[lost].all()
 
 
@@ -50,7 +50,7 @@ def test_points_under_clouds_accuse_no_lines() -> None:
     line = places(rng, 120)
     clouded = line < 800.0
     reason = np.where(clouded, "cloud", "")
-    criterion = missed_criterion(line, ~clouded, reason, LINES)
+    criterion = missed_criterion("lines", line, ~clouded, reason, LINES)
     assert criterion.met
     assert criterion.value == 0.0
 
@@ -60,17 +60,27 @@ def test_the_criterion_says_which_lines_and_how_many(lines: float, needed_for: s
     line = np.linspace(0.0, LINES - 1.0, 240)
     lost = (line >= 900.0) & (line < 900.0 + lines)
     reason = np.where(lost, "low_score", "")
-    criterion = missed_criterion(line, ~lost, reason, LINES)
+    criterion = missed_criterion("lines", line, ~lost, reason, LINES)
     assert not criterion.met
     assert criterion.needed_for == needed_for
     assert criterion.value == pytest.approx(100.0 * lines / LINES, abs=1.0)
     assert f"lines {line[lost][0]:.0f} and {line[lost][-1]:.0f}" in criterion.note
 
 
+def test_a_detector_whose_points_do_not_agree_is_named_by_its_samples() -> None:
+    sample = np.linspace(0.0, LINES - 1.0, 240)
+    beside = (sample >= 500.0) & (sample < 1000.0)
+    reason = np.where(beside, "deactivated", "")
+    criterion = missed_criterion("samples", sample, ~beside, reason, LINES)
+    assert (criterion.name, criterion.needed_for) == ("missed_along_samples", "usable")
+    assert "samples 502 and 995" in criterion.note
+    assert "a detector is out of place" in criterion.note
+
+
 def test_lost_lines_reach_to_the_border_that_no_point_is_beyond() -> None:
     line = np.linspace(100.0, LINES - 101.0, 240)
     lost = line >= 1700.0
-    criterion = missed_criterion(line, ~lost, np.where(lost, "border_peak", ""), LINES)
+    criterion = missed_criterion("lines", line, ~lost, np.where(lost, "border_peak", ""), LINES)
     assert criterion.value == pytest.approx(15.0, abs=1.0)
 
 
@@ -79,7 +89,7 @@ def test_ground_that_moved_beside_others_is_not_taken_for_lost_lines() -> None:
     band = (line >= 900.0) & (line < 1400.0)
     agrees = ~band
     agrees[np.flatnonzero(band)[::6]] = True
-    criterion = missed_criterion(line, agrees, np.where(agrees, "", "low_score"), LINES)
+    criterion = missed_criterion("lines", line, agrees, np.where(agrees, "", "low_score"), LINES)
     assert criterion.met
     assert criterion.value == 0.0
 
@@ -88,5 +98,5 @@ def test_chips_that_a_break_of_the_image_cuts_do_not_count() -> None:
     line = np.linspace(0.0, LINES - 1.0, 240)
     cut = np.abs(line - 1000.0) < 100.0
     reason = np.where(cut, "deactivated", "")
-    assert not missed_criterion(line, ~cut, reason, LINES).met
-    assert missed_criterion(line, ~cut, reason, LINES, ~cut).met
+    assert not missed_criterion("lines", line, ~cut, reason, LINES).met
+    assert missed_criterion("lines", line, ~cut, reason, LINES, shown=~cut).met
