@@ -205,6 +205,14 @@ def test_sigmas_that_were_too_large_are_not_made_smaller() -> None:
     )
 
 
+@pytest.mark.parametrize("tolerance", [1.5, 2.7])
+def test_honest_sigmas_have_unit_weight_whatever_the_tolerance(tolerance: float) -> None:
+    """A tolerance keeps the smaller residuals: within 1.5 sigma, they have 0.74 of their sigma."""
+    points = seen(TRUTH["shift"], np.random.default_rng(24), n=400)
+    result = points.adjust(AdjustmentOptions(order="shift", tolerance=tolerance))
+    assert result.sigma0 == pytest.approx(1.0, rel=0.06)
+
+
 @pytest.mark.monte_carlo
 def test_imprecise_points_weigh_little() -> None:
     rng = np.random.default_rng(10)
@@ -425,10 +433,11 @@ def test_a_drift_does_not_cost_good_points_where_most_lie_together(drift_px: flo
         assert result.active.sum() >= 27
 
 
-def test_a_user_s_order_is_refused_where_points_on_a_line_leave_it_open() -> None:
+@pytest.mark.parametrize("samples", [1.0, 0.5], ids=["through the middle", "beside the middle"])
+def test_a_user_s_order_is_refused_where_points_on_a_line_leave_it_open(samples: float) -> None:
     rng = np.random.default_rng(17)
     points = seen(TRUTH["shift"], rng, 20)
-    predicted = np.linspace(0.1, 0.9, 20)[:, None] * np.array(SHAPE)
+    predicted = np.linspace(0.1, 0.9, 20)[:, None] * np.array(SHAPE) * [1.0, samples]
     line_sample = points.truth.apply(predicted) + rng.normal(0.0, NOISE_PX, (20, 2))
     ground = FlatModel().locate(predicted, np.zeros(20))
     on_a_line = replace(points, lon_lat_h=ground, line_sample=line_sample)
@@ -438,6 +447,24 @@ def test_a_user_s_order_is_refused_where_points_on_a_line_leave_it_open() -> Non
     # Left to the adjustment, what no point determines is uncertain, away from the line.
     beside = np.array([[0.0, SHAPE[1] - 1.0]])
     assert np.diagonal(on_a_line.adjust().covariance_at(beside)[0]).min() > 0.5
+
+
+def test_a_repetition_expects_drifts_as_large_as_the_whole_does() -> None:
+    """Points in the middle tell little of drift and skew: the corners are as uncertain as expected."""
+    points = seen(TRUTH["shift"], np.random.default_rng(25), 60)
+    middle = (np.abs(points.line_sample / np.array(SHAPE) - 0.5) < 0.2).all(axis=1)
+    observations = ControlObservations(
+        points.lon_lat_h, points.line_sample, points.sigma_px, points.covariance_m2, middle
+    )
+    alone = adjust_scene(FlatModel(), SHAPE, observations)
+    corner = np.zeros((1, 2))
+
+    def repeated_std_px(slope_px: float) -> float:
+        like = replace(alone, slope_px=slope_px, bends=())
+        result = adjust_scene(FlatModel(), SHAPE, observations, like=like)
+        return float(np.sqrt(result.covariance_at(corner)[0, 0, 0]))
+
+    assert repeated_std_px(0.01) < 0.5 * repeated_std_px(1.0)
 
 
 def test_the_covariance_of_a_place_is_that_of_where_the_delivered_model_puts_it() -> None:

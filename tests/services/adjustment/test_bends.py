@@ -1,21 +1,25 @@
 """Points on a part of an image leave open how the rest of it is bent, and the accuracy says so."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from services.adjustment.bends import bends
+from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
 from services.adjustment.structure import Residuals
 from services.quality.normal_law import normal_ce90
 from services.types import Array
 from tests.services.adjustment.test_displacement_components import (
     SHAPE,
     WRONG,
-    Trial,
     both,
     bow,
+    draw,
     still,
     trial,
 )
+from tests.services.conftest import FlatModel
 
 ON_SAMPLES = 1.0, 0.6
 """Points on three fifths of the samples."""
@@ -29,11 +33,11 @@ BENT = {
 }
 
 
-def corners_px(one: Trial) -> Array:
+def corners_px(adjustment: SceneAdjustment) -> Array:
     """CE90 (2, 2) at the corners of the image, by line and sample."""
     last = np.array(SHAPE) - 1.0
     corners = np.array([[line, sample] for line in (0.0, last[0]) for sample in (0.0, last[1])])
-    return normal_ce90(one.adjustment.covariance_at(corners)).reshape(2, 2)
+    return normal_ce90(adjustment.covariance_at(corners)).reshape(2, 2)
 
 
 @pytest.mark.monte_carlo
@@ -48,7 +52,7 @@ def test_bends_beyond_the_points_are_within_what_is_stated(name: str) -> None:
 @pytest.mark.monte_carlo
 def test_a_bend_that_is_half_seen_makes_the_image_less_accurate_where_no_points_reach() -> None:
     trials = [trial(bow(2.5, axis=1), seed, count=40, reach=ON_SAMPLES) for seed in range(12)]
-    before, beyond = np.mean([corners_px(one) for one in trials], axis=(0, 1))
+    before, beyond = np.mean([corners_px(one.adjustment) for one in trials], axis=(0, 1))
     assert beyond > 2.5 * before
 
 
@@ -57,7 +61,7 @@ def test_straight_images_with_points_on_a_part_stay_usable() -> None:
     trials = [trial(still, seed, count=40, reach=ON_SAMPLES) for seed in range(24)]
     assert 0.5 < np.mean([one.normalised for one in trials]) < 1.0
     usable_px = 3.0
-    assert sum(corners_px(one).max() < usable_px for one in trials) >= 20
+    assert sum(corners_px(one.adjustment).max() < usable_px for one in trials) >= 20
 
 
 @pytest.mark.monte_carlo
@@ -70,6 +74,31 @@ def test_points_all_over_a_straight_image_leave_its_correction_as_good_as_an_aff
         grid = one.adjustment.correction.displacement
         assert grid is not None
         assert np.abs(grid.displacement_px).max() < 0.5
+
+
+def test_bends_are_left_open_in_pixels_whatever_the_sigmas_state() -> None:
+    observations, _ = draw(still, np.random.default_rng(2), count=40, reach=ON_SAMPLES)
+    too_small = replace(observations, sigma_px=observations.sigma_px / 4.0)
+    honest, understated = (adjust_scene(FlatModel(), SHAPE, one) for one in (observations, too_small))
+    assert honest.bends
+    assert understated.bends
+    assert corners_px(understated)[:, 1] == pytest.approx(corners_px(honest)[:, 1], rel=0.2)
+
+
+def test_a_repetition_leaves_open_the_bends_that_the_whole_does() -> None:
+    observations, _ = draw(still, np.random.default_rng(2), count=40, reach=ON_SAMPLES)
+    whole = adjust_scene(FlatModel(), SHAPE, observations)
+    part = replace(observations, usable=np.arange(40) % 5 > 0)
+    repeated = adjust_scene(FlatModel(), SHAPE, part, like=whole)
+    assert whole.bends
+    assert (corners_px(repeated)[:, 1] > 0.9 * corners_px(whole)[:, 1]).all()
+
+
+def test_no_bend_is_left_open_where_the_user_gives_an_order() -> None:
+    observations, _ = draw(still, np.random.default_rng(2), count=40, reach=ON_SAMPLES)
+    given = adjust_scene(FlatModel(), SHAPE, observations, AdjustmentOptions(order="affine"))
+    assert given.bends == ()
+    assert given.correction.displacement is None
 
 
 def residuals(place: Array, misfit: Array, sigma_px: float) -> Residuals:

@@ -201,6 +201,31 @@ def test_chips_show_less_of_a_fast_jitter_which_is_taken_into_account() -> None:
     assert 0.5 < np.mean([one.normalised for one in trials]) < 2.0
 
 
+def corrected(observations: ControlObservations) -> Array:
+    """Where a correction puts places all over the image (n, 2)."""
+    places = np.random.default_rng(0).random((300, 2)) * (np.array(SHAPE) - 1.0)
+    adjustment = adjust_scene(FlatModel(), SHAPE, observations)
+    assert adjustment.components
+    return adjustment.correction.apply(places)
+
+
+@pytest.mark.parametrize("name", ["slow jitter", "jitter that changes"])
+def test_a_motion_is_followed_as_far_whatever_the_sigmas_state(name: str) -> None:
+    observations, _ = draw(MOTIONS[name], np.random.default_rng(4), wrong=0.0)
+    too_small = replace(observations, sigma_px=observations.sigma_px / 8.0)
+    assert corrected(too_small) == pytest.approx(corrected(observations), abs=0.1)
+
+
+def test_a_chip_shows_of_a_smooth_motion_what_is_left_of_its_mean_over_the_chip() -> None:
+    observations, _ = draw(bow(6.0), np.random.default_rng(4), count=200, sigma_px=0.2, wrong=0.0)
+    side_px = 800.0
+    wide = replace(observations, chip_side_px=side_px)
+    (smooth,) = adjust_scene(FlatModel(), SHAPE, wide).components
+    offsets = np.linspace(-0.5, 0.5, 401) * side_px
+    lost = 1.0 - np.exp(-0.5 * (offsets / smooth.length_px) ** 2).mean()
+    assert 1.0 - smooth.seen == pytest.approx(lost, rel=0.1)
+
+
 def test_residuals_that_grow_with_height_are_named_so() -> None:
     trials = [trial(still, seed, by_height_px=1.5) for seed in range(8)]
     assert all(one.chance("height") < MAX_CHANCE for one in trials)

@@ -81,6 +81,8 @@ def test_a_swing_shorter_than_chips_is_found_with_its_period_and_its_size(period
     assert [one.structure.at for one in results] == pytest.approx([period] * 8, rel=0.08)
     sizes = np.mean([np.sqrt(2.0 * one.variance_px2) for one in results], axis=0)
     assert sizes == pytest.approx(size_px, rel=0.15)
+    largest = np.mean([one.structure.largest_px for one in results])
+    assert largest == pytest.approx(np.hypot(*size_px), rel=0.15)
 
 
 def test_several_swings_add_up() -> None:

@@ -78,6 +78,19 @@ def test_a_sensor_that_changes_its_gain_or_its_offset_breaks_nothing() -> None:
             assert not found(pixels)
 
 
+@pytest.mark.parametrize(("parts", "told"), [(8, True), (5, False)])
+def test_what_chance_makes_at_some_line_of_many_is_no_break(parts: int, told: bool) -> None:
+    """Of 8 parts, 5 differ most at a given line once in 30,000: at some of 900 in every 30th image."""
+    width = SAMPLES // 32
+    for seed in range(4):
+        pixels = ground(seed)
+        pixels[:, : parts * width] = broken(ground(seed, (LINES + 12, SAMPLES)), 450, 12)[
+            :, : parts * width
+        ]
+        pixels[:, 8 * width :] = np.nan
+        assert found(pixels) == ([450] if told else [])
+
+
 def test_a_break_is_seen_where_the_sensor_changes_its_gain() -> None:
     pixels = broken(ground(5), 450, 12)
     pixels[450:] = 1.2 * pixels[450:] + 60.0
