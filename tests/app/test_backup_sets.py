@@ -15,7 +15,7 @@ from app.db import engine, stored_files
 from app.db.cluster import backup as archive
 from app.db.cluster.embedded import Cluster
 from app.errors import Conflict, InputError
-from app.storage import MARKER, Storage, open_storage, trash
+from app.storage import MARKER, Storage, open_storage, read_marker, trash
 from app.usecases import storage_identity
 from app.usecases.backups import make
 from app.usecases.backups.make import make_backup
@@ -31,7 +31,7 @@ from app.usecases.backups.restore import RESTORING, restore_backup
 from app.usecases.installation import Installation
 from app.worker.sweep import sweep_files
 from tests.app.conftest import EMPTY_TEMPLATE, fresh_database
-from tests.app.full_storage import Full, contents
+from tests.app.full_storage import Full, another, contents
 from tests.statements import run_sql
 
 KILLED_AT = """
@@ -144,6 +144,9 @@ def test_a_backup_names_every_kind_of_stored_file_that_is_damaged(full: Full, tm
     assert made.returncode == 1
     assert sorted(json.loads(made.stdout)["damaged"]) == keys
     assert all(key in made.stderr for key in keys)
+    with engine.connect(full.dsn) as connection:
+        known = run_sql(connection, "select storage_key from damaged_file").fetchall()
+    assert sorted(row["storage_key"] for row in known) == keys
     assert find_problems(tmp_path / "backup", read_manifest(tmp_path / "backup")) == []
 
 
@@ -183,6 +186,13 @@ def add_a_link(folder: Path) -> str:
     return "link: surplus"
 
 
+def link_to_the_same_file(folder: Path) -> str:
+    path = next((folder / STORAGE / "scenes").rglob("a.tif"))
+    elsewhere = path.rename(folder.with_name(f"{folder.name}-elsewhere.tif"))
+    path.symlink_to(elsewhere)
+    return f"{path.relative_to(folder).as_posix()}: it is no regular file"
+
+
 def cut_a_file(folder: Path) -> str:
     path = next((folder / STORAGE / "uploads").rglob("a.zip"))
     path.unlink()
@@ -196,6 +206,7 @@ CHANGES: tuple[Callable[[Path], str], ...] = (
     delete_a_file,
     add_a_file,
     add_a_link,
+    link_to_the_same_file,
     cut_a_file,
 )
 
@@ -260,6 +271,36 @@ def test_a_killed_restore_is_continued_by_the_next_one(full: Full, cluster: Clus
             assert_whole(settings, placed(full))
             with pytest.raises(Conflict, match="files already"):
                 restore_backup(dsn, open_storage(settings), backup)
+
+
+@pytest.mark.parametrize("kind", ["folder"])
+def test_a_restore_that_broke_off_mends_its_files_and_takes_no_other_database(
+    full: Full, cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def broken(*_: object) -> None:
+        raise InputError("the connection broke")
+
+    backed_up(full, tmp_path / "backup")
+    with fresh_database(cluster, EMPTY_TEMPLATE) as dsn, another(cluster) as other:
+        settings = empty(full, dsn, tmp_path / "restored")
+        storage = open_storage(settings)
+        with monkeypatch.context() as patch:
+            patch.setattr(archive, "restore", broken)
+            with pytest.raises(InputError, match="broke"):
+                restore_backup(dsn, storage, tmp_path / "backup")
+        with pytest.raises(Conflict, match="tables already"):
+            restore_backup(other, storage, tmp_path / "backup")
+        storage.put(storage.keys("scenes")[0], [b"half of it"])
+        restore_backup(dsn, storage, tmp_path / "backup")
+        assert_whole(settings, placed(full))
+
+
+@pytest.mark.parametrize("kind", ["folder"])
+def test_the_database_of_a_backup_is_older_than_the_storage_that_goes_on(full: Full, tmp_path: Path):
+    manifest = backed_up(full, tmp_path / "backup")
+    marker = read_marker(open_storage(full.settings))
+    assert marker is not None
+    assert marker.generation > manifest.generation
 
 
 @pytest.mark.parametrize("kind", ["folder"])

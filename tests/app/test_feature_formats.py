@@ -214,6 +214,16 @@ def test_a_tile_has_the_features_of_its_place_in_a_layer_of_the_collection(get, 
     )
 
 
+def test_a_tile_states_the_horizontal_accuracy_of_each_point(get, made, tmp_path):
+    reply = get(TILES.format("points", 8, *tile_of(5.25, 43.25, 8)))
+    (tmp_path / "tile.mvt").write_bytes(reply.content)
+    meta, _, _, values = read_features(tmp_path / "tile.mvt", layer="points")
+    fields = dict(zip(meta["fields"].tolist(), values, strict=True))
+    variance_m2 = np.diagonal(made.points.covariance_m2, 0, 1, 2)[:, :2].mean(axis=1)
+    stated_m = fields["sigma_horizontal_m"][np.argsort(fields["id"])]
+    assert_allclose(stated_m, np.sqrt(variance_m2), rtol=1e-5)
+
+
 def test_a_tile_has_the_health_of_points_that_scenes_have_tried(get, connection, tmp_path):
     """One point failed in six scenes where all others served."""
     tried = "insert into point_history (point_id, attempts, successes, expected) values (%s, 6, %s, 6)"

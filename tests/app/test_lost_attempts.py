@@ -168,6 +168,32 @@ def test_an_attempt_learns_by_its_progress_that_it_lost_its_job(
     assert reached == []
 
 
+def reserved_bytes(database: Database, job: Job) -> int:
+    with database.transaction() as connection:
+        row = run_sql(connection, "select results_bytes from job where id = %s", [job.id]).fetchone()
+    assert row is not None
+    return int(row["results_bytes"])
+
+
+def test_the_room_of_the_last_attempt_is_given_back_by_itself_alone_and_once_it_is_over(database, job):
+    def release(attempt: int) -> None:
+        with database.transaction() as connection:
+            attempts.release_results(connection, job.id, attempt)
+
+    taken_over(database, job)
+    heir = job.attempt + 1
+    with database.transaction() as connection:
+        attempts.reserve_results(connection, job.id, heir, 1000)
+    release(heir)
+    assert reserved_bytes(database, job) == 1000
+    with database.transaction() as connection:
+        attempts.fail(connection, job.id, heir, {"title": "no"})
+    release(job.attempt)
+    assert reserved_bytes(database, job) == 1000
+    release(heir)
+    assert reserved_bytes(database, job) == 0
+
+
 LEASE_S = 0.6
 
 

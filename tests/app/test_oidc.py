@@ -15,7 +15,7 @@ from app import oidc
 from app.db import engine
 from app.errors import NotAllowed
 from app.main import create_app
-from app.oidc import Issuer
+from app.oidc import Identity, Issuer
 from app.usecases.tokens import revoke_token
 
 pytestmark = pytest.mark.security
@@ -149,8 +149,15 @@ def test_a_token_signed_by_somebody_else_or_by_nobody_is_refused(client, issuer)
         assert client.get("/tokens/self", headers=headers).status_code == 401
 
 
+def test_clocks_of_issuer_and_service_may_differ_by_seconds_and_not_by_minutes(client, issuer):
+    for ago_s, status in ((5.0, 200), (120.0, 401)):
+        headers = issuer.token(exp=time.time() - ago_s)
+        assert client.get("/tokens/self", headers=headers).status_code == status
+
+
 def test_a_claim_that_maps_to_nothing_allows_nothing(client, issuer):
-    assert client.get("/tokens/self", headers=issuer.token(scope="openid")).status_code == 403
+    for scope in ("openid", "xamers:admin", "amers:admin.not", ["amers:admin openid"]):
+        assert client.get("/tokens/self", headers=issuer.token(scope=scope)).status_code == 403
 
 
 def test_an_identity_is_revoked_here_whatever_its_issuer_says(client, issuer, dsn):
@@ -231,6 +238,42 @@ def test_a_document_of_another_issuer_or_of_any_size_is_not_used(settings, issue
     large = Issuer(settings.model_copy(update={"oidc_issuer": issuer.url}))
     with pytest.raises(NotAllowed):
         large.identify(issuer.token()["Authorization"].split()[1])
+
+
+def test_one_subject_of_two_issuers_is_two_identities(settings, issuer):
+    def identity(of: LocalIssuer) -> Identity:
+        one = Issuer(settings.model_copy(update={"oidc_issuer": of.url}))
+        return one.identify(of.token()["Authorization"].split()[1])
+
+    other = LocalIssuer()
+    try:
+        assert identity(issuer) == identity(issuer)
+        assert identity(issuer).subject != identity(other).subject
+    finally:
+        other.server.shutdown()
+        other.server.server_close()
+
+
+@pytest.mark.parametrize(("keys_url", "fetched"), [("https://keys.example", True), ("http:", False)])
+def test_an_issuer_with_https_has_its_keys_fetched_with_https_alone(
+    settings, issuer, monkeypatch, keys_url, fetched
+):
+    """The documents are those of the issuer on this machine, at other addresses."""
+    url, document = "https://issuer.example", oidc._document
+
+    def answered(address: str) -> dict[str, object]:
+        if address == f"{url}/.well-known/openid-configuration":
+            return {"issuer": url, "jwks_uri": f"{keys_url}/keys"}
+        return document(f"{issuer.url}/keys")
+
+    monkeypatch.setattr(oidc, "_document", answered)
+    one = Issuer(settings.model_copy(update={"oidc_issuer": url}))
+    token = issuer.token(iss=url)["Authorization"].split()[1]
+    if fetched:
+        assert one.identify(token).name == "Survey office"
+    else:
+        with pytest.raises(NotAllowed):
+            one.identify(token)
 
 
 def test_tokens_of_our_own_go_on_beside_those_of_the_issuer(client, bearer):

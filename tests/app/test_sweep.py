@@ -12,6 +12,7 @@ from fastapi.testclient import TestClient
 from app.db.engine import Database
 from app.db.uploads import LIFE_HOURS
 from app.storage import Storage
+from app.usecases.garbage_collection import FILES_AT_ONCE, Bin, Family
 from app.worker.sweep import MOST_BETWEEN_S, sweep_files
 from tests.app.point_history import jump
 from tests.statements import run_sql
@@ -59,6 +60,28 @@ def clocks_jump(database: Database, storage: Storage, hours: int) -> None:
     for path in storage.folder.rglob("*"):
         status = path.stat()
         os.utime(path, (status.st_atime - 3600 * hours, status.st_mtime - 3600 * hours))
+
+
+def family(given_up: int, unknown: int) -> Family:
+    """A family of a thousand results, of which some are given up or unknown."""
+    return Family(
+        "results",
+        10 * FILES_AT_ONCE,
+        [f"results/given-up-{number}" for number in range(given_up)],
+        [f"results/unknown-{number}" for number in range(unknown)],
+    )
+
+
+def test_a_sweep_removes_a_small_part_of_the_files_whatever_the_rows_say(storage: Storage):
+    few, some = family(3, 2), family(FILES_AT_ONCE, 2)
+    many = family(2 * FILES_AT_ONCE, FILES_AT_ONCE + 1)
+    rubbish = Bin(storage)
+    assert set(rubbish.remove_unnamed(few)) == {*few.given_up, *few.unknown}
+    removed = rubbish.remove_unnamed(some)
+    assert len(removed) == FILES_AT_ONCE
+    assert set(removed) > set(some.unknown)
+    assert rubbish.remove_unnamed(many) == many.given_up[:FILES_AT_ONCE]
+    assert len(Bin(storage, limited=False).remove_unnamed(many)) == 3 * FILES_AT_ONCE + 1
 
 
 @pytest.mark.parametrize("hours", [25, A_YEAR_H, -A_YEAR_H])
