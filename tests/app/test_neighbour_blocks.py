@@ -11,6 +11,8 @@ from app.errors import InputError
 from app.usecases.control_files import IMAGES_NPZ, ControlFiles, control_inputs
 from app.usecases.image_production import ProductionImages, run_production
 from app.usecases.production import BlockIdentity
+from app.usecases.registration.joined_scenes import SCENES_JSON, Member, format_scenes, read_joined
+from app.usecases.registration.register import SceneFiles
 from services.adjustment.known_images import KnownImages
 from services.errors import FormatError
 from services.formats.adjusted_images import read_adjusted_images, write_adjusted_images
@@ -76,6 +78,28 @@ def test_a_folder_without_images_is_named(tmp_path) -> None:
     (tmp_path / IMAGES_NPZ).write_bytes(b"PK no archive")
     with pytest.raises(FormatError, match=r"images\.npz: the adjusted images of a block expected"):
         read_adjusted_images(tmp_path / IMAGES_NPZ)
+
+
+def test_scenes_that_others_join_come_back_as_they_were_written(tmp_path) -> None:
+    """With all that reads them again, but for those that their adjustment does not know."""
+    files = SceneFiles(
+        tmp_path / "a.tif",
+        model=tmp_path / "a.xml",
+        sigma_m=3.5,
+        bands="4,3,2",
+        mask=tmp_path / "clouds.tif",
+        rigorous="attitude",
+    )
+    known = (
+        Member("a", str(files.image), files, (-12.5, 410.0)),
+        Member("b é", "5f0c", SceneFiles(Path("5f0c")), (0.0, 1.0)),
+    )
+    unknown = replace(known[1], name="c")
+    write_adjusted_images(tmp_path / IMAGES_NPZ, "block", KNOWN)
+    (tmp_path / SCENES_JSON).write_text(format_scenes([*known, unknown]))
+    joined = read_joined(tmp_path)
+    assert joined.members == known
+    assert joined.known.names == KNOWN.names
 
 
 def in_image(production: Production, name: str, line_sample: Array) -> Array:

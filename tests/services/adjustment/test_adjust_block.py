@@ -257,6 +257,55 @@ def test_no_order_of_the_images_changes_the_block(five: list[ViewGeometry]) -> N
     )
 
 
+def test_a_block_across_180_degrees_is_that_of_any_other_place(five: list[ViewGeometry]) -> None:
+    ties = make_ties(five, np.random.default_rng(9), 200, NOISE_PX)
+    east_deg = 180.0 - ties.lon_lat_h[:, 0].mean()
+    moved = [
+        replace(one, rpc=replace(one.rpc, ground_offset=one.rpc.ground_offset + [east_deg, 0.0, 0.0]))
+        for one in five
+    ]
+    here, there = (adjusted(of, ties.observations) for of in (five, moved))
+    assert np.nanmin(there.lon_lat_h[:, 0]) < -179.9
+    assert np.nanmax(there.lon_lat_h[:, 0]) > 179.9
+    assert np.nanmax(np.abs(there.lon_lat_h[:, 0])) <= 180.0
+    back = there.lon_lat_h - [east_deg, 0.0, 0.0]
+    back[:, 0] = (back[:, 0] + 180.0) % 360.0 - 180.0
+    assert np.nanmax(np.abs(difference_m(back, here.lon_lat_h))) < a_centimetre
+
+
+def test_residuals_are_pixels_between_what_is_seen_and_where_the_models_show_the_points(
+    trials: list[Trial],
+) -> None:
+    block, seen = trials[0].block, trials[0].ties.observations
+    rows = np.flatnonzero(np.isfinite(block.lon_lat_h[seen.point, 0]))
+    shown = np.array(
+        [
+            block.models[seen.image[row]].project(block.lon_lat_h[seen.point[row]][None, :])[0]
+            for row in rows
+        ]
+    )
+    np.testing.assert_allclose(
+        block.residual_px[rows], seen.line_sample[rows] - shown, atol=a_millipixel
+    )
+
+
+def test_the_share_that_observations_tell_of_a_parameter_is_what_they_take_off_its_prior(
+    five: list[ViewGeometry],
+) -> None:
+    slope_px = 0.2
+    images = [
+        image_parameters(g.plan.image_id, g.rpc, g.plan.shape, shift_px=PRIOR_PX, slope_px=slope_px)
+        for g in five
+    ]
+    ties = make_ties(five, np.random.default_rng(10), 20, NOISE_PX)
+    block = adjust_block(images, ties.observations)
+    prior_px = np.tile([PRIOR_PX, slope_px * block.slope_factor, slope_px * block.slope_factor], 2)
+    variance = block.accuracy.variance().reshape(5, 6)
+    np.testing.assert_allclose(block.determined, 1.0 - variance / prior_px**2, atol=0.01)
+    slopes = block.determined[:, [1, 2, 4, 5]]
+    assert 0.05 < slopes.min() < slopes.max() < 0.95
+
+
 def test_the_observations_that_leave_are_the_wrong_ones(trials: list[Trial]) -> None:
     wrong = np.concatenate([t.ties.wrong for t in trials])
     active = np.concatenate([t.block.active for t in trials])
