@@ -45,17 +45,18 @@ ISLANDS = shapely.union_all([shapely.box(0, 0, 0.3, 0.4), shapely.box(0.65, 0.7,
 def ingest(connection: Connection, storage: Storage, tmp_path: Path) -> Ingest:
     """Publishes a block of points that lie in a box of 0.1 degree as given in the unit square."""
 
-    def run(positions: Array, west: float = 5.2, south: float = 43.2) -> Block:
+    def run(positions: Array, west: float = 5.2, south: float = 43.2, version: str = "1") -> Block:
         box = (west, south, west + SIDE_DEG, south + SIDE_DEG)
         points = control_points(len(positions), np.random.default_rng(1), box, 2, GSDS_M)
         lon = west + SIDE_DEG * positions[:, 0]
         lat = south + SIDE_DEG * positions[:, 1]
         lon = np.where(lon > 180.0, lon - 360.0, lon)
         points = replace(points, lon_lat_h=np.column_stack([lon, lat, points.lon_lat_h[:, 2]]))
-        described = metadata(box=box, gsds_m=GSDS_M)
+        described = metadata(version=version, box=box, gsds_m=GSDS_M)
         models = {"IMG_00": affine_model(described.extent.mean(axis=0))}
-        write_block(tmp_path / "block", described, points, noise_chips(points), models)
-        block = lifecycle.ingest_block(connection, storage, tmp_path / "block").block
+        folder = tmp_path / f"block-{version}"
+        write_block(folder, described, points, noise_chips(points), models)
+        block = lifecycle.ingest_block(connection, storage, folder).block
         lifecycle.publish_block(connection, str(block.number))
         connection.commit()
         return block
@@ -102,6 +103,20 @@ def test_islands_are_outlined_one_by_one(ingest, outline):
     drawn = in_unit_square(outline())
     assert shapely.get_num_geometries(drawn) == 2
     assert shapely.distance(drawn, shapely.points(positions)).max() <= touching_deg
+
+
+def test_an_outline_is_that_of_the_points_of_its_own_version(ingest, outline, connection):
+    east = shapely.box(0.7, 0.0, 1.0, 1.0)
+    first = ingest(spread(shapely.box(0.0, 0.0, 0.3, 1.0)))
+    second = ingest(spread(east), version="2")
+    at_once = outline()
+    drawn = in_unit_square(at_once)
+    assert shapely.area(shapely.symmetric_difference(drawn, east)) < 0.3 * east.area
+    for block in (first, second):
+        ids = {"first": block.number << ID_BITS, "end": (block.number + 1) << ID_BITS}
+        connection.execute(text(FILL), {"number": block.number, **ids})
+    connection.commit()
+    assert outline().equals(at_once)
 
 
 def test_an_outline_across_180_degrees_is_cut_there(ingest, outline):

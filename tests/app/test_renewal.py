@@ -19,6 +19,7 @@ from app.db.blocks import list_blocks
 from app.db.engine import Connection, Database
 from app.db.jobs.attempts import LostJob
 from app.db.points import points_of_block
+from app.db.renewal import StoredSearches
 from app.errors import Conflict
 from app.storage import Storage
 from app.usecases.blocks import lifecycle
@@ -225,6 +226,21 @@ def test_evidence_of_older_versions_is_not_lost(
     assert np.abs(place - scenes.years.places[scenes.changed]).max() < 1.0
 
 
+def test_searches_tell_of_the_points_at_exactly_their_places() -> None:
+    """A point that an older version had elsewhere tells of none."""
+    places = np.array([[5.0, 43.0, 100.0], [5.1, 43.0, 100.0], [5.0, 43.0, 101.0]])
+    stored = StoredSearches(
+        scene=np.array([0, 0, 1, 1]),
+        lon_lat_h=places[[2, 0, 1, 0]],
+        found=np.array([False, True, False, True]),
+        days=np.array(["2024-04-10", "2024-07-20"], dtype="datetime64[D]"),
+    )
+    own = stored.of_points(places[:2])
+    assert (own.scene.tolist(), own.point.tolist()) == ([0, 1, 1], [0, 1, 0])
+    assert own.found.tolist() == [True, False, True]
+    assert own.days is stored.days
+
+
 def refused(words: list[object]) -> str:
     result = CliRunner().invoke(amers, [*map(str, words)])
     assert result.exit_code != 0, result.output
@@ -366,6 +382,7 @@ def test_an_administrator_renews_a_block_by_a_job(
     dsn: str,
 ) -> None:
     admin, me = bearer("admin"), bearer("register")
+    assert client.patch("/blocks/flat", json={"priority": 3}, headers=admin).status_code == 200
     register = job_runner(client, database, settings, me)
     image = scenes.year[0]
     name = f"/scenes?name={image.name}&sigma_m={SIGMA_M}"
@@ -389,6 +406,8 @@ def test_an_administrator_renews_a_block_by_a_job(
     assert job["status"] == "successful", job
     results = client.get(f"/jobs/{job['jobID']}/results", headers=admin).json()
     assert (results["id"], results["version"], results["state"]) == ("flat", "2", "staged")
+    with database.reading() as connection:
+        assert [block.priority for block in list_blocks(connection, ("staged", "published"))] == [3, 3]
     document = client.get(results["renewal.json"]["href"], headers=admin).json()
     assert document["new_views"] == results["new_views"]
     # All points get views, not only the ninety that the registration tried.

@@ -1,6 +1,6 @@
 """Ortho-images show each pixel where the model and the terrain place it."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from services.errors import CoverageError
+from services.errors import ComputationError, CoverageError
 from services.formats.images.ortho import write_cog
 from services.imagery.scene import Scene
 from services.imagery.source import ArrayImage
@@ -16,6 +16,7 @@ from services.lines_of_sight import intersect_terrain
 from services.map_grid import MapGrid
 from services.orthorectification import rectify as module
 from services.orthorectification.mapping import map_into_image, occluded_ground
+from services.orthorectification.point_terrain import terrain_of_points
 from services.orthorectification.rectify import (
     OrthoOptions,
     OrthoWindow,
@@ -26,7 +27,9 @@ from services.orthorectification.rectify import (
 from services.sensors.rpc_fit import fit_rpc
 from services.simulation.orbit import pushbroom_over
 from services.terrain import Terrain
-from services.types import Acquisition, FloatImage
+from services.types import Acquisition, Array, FloatImage
+from tests.factories import affine_model
+from tests.services.conftest import METRE_DEG, FlatModel
 
 the_tolerance_px = 0.1
 a_hundredth_of_a_pixel = 0.01
@@ -123,6 +126,53 @@ def test_the_map_covers_the_ground_of_the_scene_and_little_more() -> None:
     coarse = choose_grid(scene(), ground, gsd_m=7.0)
     np.testing.assert_allclose(np.abs(coarse.step_xy[[0, 1], [1, 0]]), 7.0)
     np.testing.assert_allclose((coarse.origin_xy / 7.0 - 0.5) % 1.0 % 1.0, 0.0, atol=1e-6)
+
+
+def test_the_map_of_a_scene_across_180_degrees_is_as_large_as_that_of_another() -> None:
+    model = replace(affine_model(np.array([180.0, -16.0])), image_offset=np.array(SHAPE) / 2.0)
+    across = Scene(ArrayImage(np.zeros(SHAPE, dtype=np.float32)), model, Acquisition("a"), 5.0)
+    places = np.array([[179.999, -16.0, 190.0], [-179.999, -16.001, 210.0], [179.9995, -15.999, 200.0]])
+    ground = terrain_of_points(places, np.array([[179.99, -16.01], [180.01, -15.99]]))
+    grid = choose_grid(across, ground)
+    assert grid.crs in ("EPSG:32701", "EPSG:32760")
+    pixels = np.random.default_rng(1).uniform(-0.5, np.array(SHAPE) - 0.5, (200, 2))
+    located = model.locate(pixels, np.full(200, 200.0))
+    assert {-1.0, 1.0} == set(np.sign(located[:, 0]))
+    assert grid.contains(grid.line_sample(located[:, :2])).all()
+    assert grid.shape[0] * grid.shape[1] < 2.2 * SHAPE[0] * SHAPE[1]
+
+
+@dataclass(frozen=True)
+class BentByHeight(FlatModel):
+    """A plane whose samples move by the cube of the height: by `cubic_px` at 100 m."""
+
+    cubic_px: float = 0.0
+
+    def project(self, lon_lat_h: Array) -> Array:
+        moved = self.cubic_px * (lon_lat_h[:, 2] / 100.0) ** 3
+        return super().project(lon_lat_h) + moved[:, None] * [0.0, 1.0]
+
+
+@pytest.mark.parametrize(("cubic_px", "followed"), [(0.2, True), (1.0, False)])
+def test_a_model_that_heights_bend_beyond_the_tolerance_is_refused(
+    cubic_px: float, followed: bool
+) -> None:
+    """A quadratic through three heights of 200 m misses 0.38 of what a cubic does at 100 m."""
+    step = np.array([[0.0, 1.0], [-1.0, 0.0]]) * 2.0 * METRE_DEG
+    grid = MapGrid("EPSG:4326", np.zeros(2), step, (150, 150))
+    heights = np.linspace(-100.0, 100.0, 150 * 150, dtype=np.float32).reshape(150, 150)
+    ground = Terrain(grid, ArrayImage(heights))
+    window, model = Window(10, 10, 100, 100), BentByHeight(cubic_px=cubic_px)
+    if not followed:
+        with pytest.raises(ComputationError, match=r"cannot be interpolated within 0\.1 px"):
+            map_into_image(model, ground, grid, window, the_tolerance_px)
+        return
+    mapping = map_into_image(model, ground, grid, window, the_tolerance_px)
+    assert mapping is not None
+    pixels = np.stack(np.indices((100, 100)), axis=-1).reshape(-1, 2) + 10.0
+    lon_lat_h = np.column_stack([grid.lon_lat(pixels), heights[10:110, 10:110].ravel()])
+    error_px = np.abs(mapping.line_sample.reshape(-1, 2) - model.project(lon_lat_h)).max()
+    assert a_hundredth_of_a_pixel < error_px < 1.02 * mapping.error_px
 
 
 def test_small_windows_and_divided_ones_give_the_same_image(monkeypatch: pytest.MonkeyPatch) -> None:
