@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from services.adjustment.affine_fit import Order
+from services.adjustment.affine_fit import FREE, AffineFit, Order
 from services.adjustment.control_observations import ControlObservations
 from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
-from services.adjustment.shared_errors import overlap_correlation
+from services.adjustment.shared_errors import offset_sigma_px, overlap_correlation
 from services.errors import NotEnoughPoints, UndeterminedCorrection
 from services.sensors.correction import ImageCorrection, no_correction
 from services.types import Array, BoolArray
@@ -499,6 +499,26 @@ def corner_std_px(points: Seen, block: np.ndarray | None, frame_m2: Array | None
     result = adjust_scene(FlatModel(), SHAPE, observations)
     corner = np.array([1.0, -1.0, -1.0, 0.0, 0.0, 0.0])
     return float(np.sqrt(corner @ result.covariance @ corner))
+
+
+def test_offsets_of_blocks_grow_with_the_residuals_of_their_points() -> None:
+    """Chance is that of the noise which the residuals show, not of the sigmas that are stated."""
+    rng = np.random.default_rng(26)
+    member = np.eye(3)[rng.integers(0, 3, 60)]
+    misfit = rng.normal(0.0, 1.0, (60, 2)) + member @ rng.normal(0.0, 0.8, (3, 2))
+
+    def apart_px(times: float) -> float:
+        fit = AffineFit(
+            np.zeros((60, 2)), times * misfit, np.ones((60, 2)), member, np.full((2, 3), 1000.0)
+        )
+        everywhere, unstated = np.ones(60, dtype=bool), np.full((2, 3), np.nan)
+        _, apart = offset_sigma_px(
+            fit, everywhere, FREE["shift"], np.inf, unit=times, stated_px=unstated
+        )
+        return apart
+
+    assert apart_px(1.0) > 0.2
+    assert apart_px(4.0) == pytest.approx(4.0 * apart_px(1.0), rel=1e-3)
 
 
 def test_blocks_that_disagree_do_not_pretend_to_agree() -> None:

@@ -92,6 +92,22 @@ def test_control_that_mostly_disagrees_is_refused_by_name() -> None:
         adjust_block(images, observations, control=replace(control, lon_lat_h=scattered))
 
 
+@pytest.mark.parametrize(("wrong", "accepted"), [(5, True), (7, False)])
+def test_a_block_follows_its_control_as_long_as_most_of_it_agrees(wrong: int, accepted: bool) -> None:
+    rng = np.random.default_rng(9)
+    truth, images, observations = draw(CASE, rng)
+    control = known_ground(truth, rng)
+    off_m = np.where(np.arange(count) < wrong, 1.0, 0.0)[:, None] * rng.uniform(-40.0, 40.0, (count, 3))
+    mixed = replace(control, lon_lat_h=move_metres(control.lon_lat_h, off_m))
+    if accepted:
+        block = adjust_block(images, observations, control=mixed)
+        assert not block.control_active[:wrong].any()
+        assert block.control_active[wrong:].all()
+    else:
+        with pytest.raises(NoConsensus, match=r"of 12 control points disagree .*P1, P2, P3"):
+            adjust_block(images, observations, control=mixed)
+
+
 def of_one_image(observations: Observations, known: int) -> Observations:
     """The observations with the first rays alone of the first `known` points."""
     first = np.unique(observations.point, return_index=True)[1]

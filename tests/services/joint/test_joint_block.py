@@ -21,7 +21,7 @@ from services.geodesy import move_metres
 from services.imagery.scene import scene_gsd_m
 from services.joint.block import JointBlock, adjust_together, repeated
 from services.joint.fitting import SceneFit, adjust_fitting, ties_between
-from services.joint.measured import MeasuredScene, nothing_found
+from services.joint.measured import MeasuredScene, nothing_found, options_in_block
 from services.joint.registration import qualified
 from services.joint.results import (
     held_cells,
@@ -326,6 +326,61 @@ def test_a_scene_without_control_points_is_stated_with_those_of_its_neighbours(
     assert 0.1 < qualification.predicted.worst_m < 3.0
     on_earth_m = qualification.predicted.on_the_earth_worst_m
     assert 2.0 * FRAME.sigma_m < on_earth_m < 4.0 * FRAME.sigma_m
+
+
+def test_control_points_are_held_out_of_all_scenes_that_show_them(registered) -> None:
+    """A fifth of those that are used, whichever scenes use them."""
+    measures = [registered(seed=seed).measures for seed in (0, 1)]
+    used = np.union1d(*(one.point_id[one.active] for one in measures))
+    for held in held_draws(measures, 4, 0.8, np.random.default_rng(3)):
+        ids = [one.point_id[rows] for one, rows in zip(measures, held, strict=True)]
+        drawn = np.union1d(*ids)
+        assert len(drawn) == len(used) - round(0.8 * len(used))
+        for one, own in zip(measures, ids, strict=True):
+            np.testing.assert_array_equal(own, np.intersect1d(drawn, one.point_id[one.active]))
+
+
+def test_what_points_share_is_in_the_accuracy_of_a_scene_of_a_block() -> None:
+    """What the match of all is off by is a shift; a deformation of the points is more at corners."""
+    rng = np.random.default_rng(22)
+    truth = truth_of(rng)
+    scenes, ties = observed(truth, rng)
+    block, _ = adjust_fitting(scenes[:2], ties_between(ties, [0, 1]), OPTIONS)
+    measured = block.scenes[0]
+    search, common_m2 = measured.search, np.array([[0.04, 0.01], [0.01, 0.09]])
+    deformed_m2 = np.diag([0.4, 0.2, 0.3])
+    frames = tuple(replace(frame, shared_m2=deformed_m2) for frame in search.points.frames)
+    shifted = replace(search, matches=replace(search.matches, common_covariance_m2=common_m2))
+    deformed = replace(search, points=replace(search.points, frames=frames))
+    last = np.array(SHAPE) - 1.0
+    places = np.array([last / 2.0, [0.0, 0.0], last])
+
+    def covariance_px2(of: MeasuredScene) -> Array:
+        changed = replace(block, scenes=(of, *block.scenes[1:]))
+        return scene_adjustment(changed, 0, OPTIONS).covariance_at(places)
+
+    derivative = measured.scene.model.project_derivative(search.points.lon_lat_h).mean(axis=0)
+    before = covariance_px2(measured)
+    by_shift = covariance_px2(replace(measured, search=shifted)) - before
+    own_px2 = derivative[:, :2] @ common_m2 @ derivative[:, :2].T
+    np.testing.assert_allclose(by_shift, np.tile(own_px2, (3, 1, 1)), rtol=0.05, atol=0.005)
+    by_deformation = covariance_px2(replace(measured, search=deformed)) - before
+    own_px2 = derivative @ deformed_m2 @ derivative.T
+    expected = np.array([0.5, 2.5, 2.5])[:, None, None] * own_px2
+    np.testing.assert_allclose(by_deformation, expected, rtol=0.05, atol=0.02)
+    assert measured.alone is not None
+    seams = replace(measured, alone=replace(measured.alone, local_sigma_px=np.array([0.6, 0.8])))
+    none = replace(measured, alone=replace(measured.alone, local_sigma_px=np.zeros(2)))
+    by_seams = covariance_px2(seams) - covariance_px2(none)
+    np.testing.assert_allclose(by_seams, np.tile(np.diag([0.36, 0.64]), (3, 1, 1)), atol=1e-6)
+
+
+def test_bends_that_the_points_of_a_scene_leave_open_are_left_to_the_ties() -> None:
+    truth = truth_of(np.random.default_rng(6))
+    scene = measured_scene(truth, 0, np.random.default_rng(6)).scene
+    own = options_in_block(scene, OPTIONS).adjustment
+    assert (OPTIONS.adjustment.bends, own.bends) == (True, False)
+    assert own == replace(OPTIONS.adjustment, bends=False)
 
 
 def test_a_point_that_one_of_the_scenes_left_shows_ties_nothing() -> None:
