@@ -300,6 +300,7 @@ def test_an_archive_with_an_image_and_its_model_becomes_a_scene(
         ({"readme": b"x"}, "none"),
         ({"a.tif": b"<VRTDataset/>"}, "neither TIFF"),
         ({"a.tif": TIFF, "zeros": bytes(LIMIT_BYTES)}, "unpacks to more"),
+        ({"a.tif": TIFF, "a b_RPC.TXT": b"LINE", "a+b_RPC.TXT": b"SAMP"}, "get the same name"),
     ],
 )
 def test_an_archive_that_could_do_harm_or_is_no_scene_is_refused(
