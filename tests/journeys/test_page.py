@@ -386,6 +386,7 @@ def test_an_administrator_uploads_a_block_which_is_ingested_and_staged(
     page.screenshot(path=ARTEFACTS / "block-upload.png")
     upload(page, "Block", archive)
     expect(page.locator(".badge")).to_have_text("successful")
+    expect(page.locator("header a[aria-current=page]")).to_have_text(["Blocks"])
     page.screenshot(path=ARTEFACTS / "block-uploaded.png")
     page.get_by_role("link", name="See the block").click()
     expect(page.get_by_role("button", name="Publish")).to_be_visible()

@@ -6,7 +6,7 @@ import type { Atlas } from "./atlas";
 import { drawBlocks } from "./blocks";
 import type { ResultFile, StatusInfo } from "./api_types";
 import { accuracy, badge, facts, figure, fill, h, problem, when } from "./elements";
-import { announce, pause, type Place, type ShowView } from "./place";
+import { announce, markSection, pause, type Place, type ShowView } from "./place";
 import type { Criterion, Report } from "./report_types";
 import { imageOnMap } from "./image_on_map";
 import { type PointResultProperties, residualVectors } from "./residuals";
@@ -23,9 +23,10 @@ export const showJob: ShowView = async (place, id) => {
   const back = h("a", { href: "#/scenes" }, "← Scenes");
   fill(panel, h("p", {}, back), heading, body);
   let job = await find(id, signal);
-  if (["ingest-block", "assess-block", "renew-block"].includes(job.processID)) {
+  if (job.processID.endsWith("-block")) {
     back.href = "#/blocks";
     back.textContent = "← Blocks";
+    markSection("blocks");
   }
   heading.textContent = job.processID.replace("-", " ").replace(/^./, (first) => first.toUpperCase());
   const running = progressOf(job);

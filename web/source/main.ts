@@ -8,7 +8,7 @@ import { drawBlocks, showBlock, showBlocks } from "./blocks";
 import { showDrawing } from "./draw";
 import { h, problem } from "./elements";
 import { showJob } from "./job";
-import { go, type ShowView } from "./place";
+import { go, markSection, type ShowView } from "./place";
 import { showPoint, showPoints } from "./points";
 import { showScene, showScenes } from "./scenes";
 
@@ -54,10 +54,7 @@ async function route(atlas: Atlas, caller: Caller | null, moved: boolean): Promi
   const { signal } = leaving;
   const [, name = "points", argument = ""] = location.hash.split("/");
   const view = VIEWS[name] ?? VIEWS["points"]!;
-  for (const link of document.querySelectorAll("header a")) {
-    if (link.getAttribute("href") === `#/${view.section}`) link.setAttribute("aria-current", "page");
-    else link.removeAttribute("aria-current");
-  }
+  markSection(view.section);
   panel.scrollTop = 0;
   try {
     await view.show({ panel, atlas, signal, scopes: caller?.scopes ?? [] }, decodeURIComponent(argument));

@@ -17,6 +17,14 @@ export function go(address: string): void {
   location.hash = address;
 }
 
+/** Mark a section of the menu as the one that is shown. */
+export function markSection(name: string): void {
+  for (const link of document.querySelectorAll("header a")) {
+    if (link.getAttribute("href") === `#/${name}`) link.setAttribute("aria-current", "page");
+    else link.removeAttribute("aria-current");
+  }
+}
+
 /** Show a short message, which screen readers read aloud. */
 export function announce(text: string): void {
   document.getElementById("status")!.textContent = text;
