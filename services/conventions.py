@@ -25,6 +25,9 @@ sensor.
 **Missing values** are NaN in float arrays, with a separate status where the reason matters.
 """
 
+STATUS_COLOURS = {"active": "#2f7ed8", "deactivated": "#e8862e", "not matched": "#8b939c"}
+"""Colours of points by their status in a registration, in reports and in layers of vectors."""
+
 CHIP_SIZE = 101
 """Lines and samples of a chip."""
 CHIP_CENTRE = 50

@@ -7,22 +7,15 @@ from statistics import fmean
 
 from osgeo import gdal
 from qgis.core import (
-    QgsCategorizedSymbolRenderer,
     QgsDataSourceUri,
-    QgsLineSymbol,
     QgsMapLayer,
-    QgsMarkerSymbol,
     QgsRasterLayer,
-    QgsRendererCategory,
-    QgsSingleSymbolRenderer,
     QgsVectorLayer,
 )
 
 from .service import Service, ServiceError
 
 POINTS_STYLE = Path(__file__).with_name("points.qml")
-STATUS_COLOURS = {"active": "#21918c", "deactivated": "#d95f02", "not matched": "#999999"}
-"""Of the control points, by their status."""
 COEFFICIENTS = ("LINE_NUM_COEFF", "LINE_DEN_COEFF", "SAMP_NUM_COEFF", "SAMP_DEN_COEFF")
 
 
@@ -47,7 +40,8 @@ def points_layer(service: Service) -> QgsVectorLayer:
 def registration_layers(image: Path, folder: Path) -> list[QgsMapLayer]:
     """The results of a registration, the lowest layer first: image on the map, residuals, points.
 
-    There is no image on the map where the registration has no RPC.
+    The styles of the vectors are those in their file. There is no image on the map where the
+    registration has no RPC.
 
     Args:
         image: that was registered.
@@ -58,17 +52,6 @@ def registration_layers(image: Path, folder: Path) -> list[QgsMapLayer]:
     """
     points = _vector_layer(folder, "control_points")
     residuals = _vector_layer(folder, "residuals")
-    categories = [
-        QgsRendererCategory(
-            status,
-            QgsMarkerSymbol.createSimple({"name": "circle", "size": "2", "color": colour}),
-            status,
-        )
-        for status, colour in STATUS_COLOURS.items()
-    ]
-    points.setRenderer(QgsCategorizedSymbolRenderer("status", categories))
-    line = QgsLineSymbol.createSimple({"line_color": "#e7298a", "line_width": "0.5"})
-    residuals.setRenderer(QgsSingleSymbolRenderer(line))
     layers: list[QgsMapLayer] = [residuals, points]
     if (folder / "refined_RPC.TXT").exists():
         heights = (feature["height_m"] for feature in points.getFeatures("\"status\" = 'active'"))

@@ -3,12 +3,13 @@
 import cv2
 import numpy as np
 
+from services.conventions import STATUS_COLOURS
 from services.reports.figure_data import Quicklook
 from services.reports.plot import WIDTH, Figure, Panel
 from services.reports.report import RegistrationReport
 from services.types import Array, BoolArray, FloatImage
 
-ACTIVE, DEACTIVATED, NOT_MATCHED = "#2f7ed8", "#e8862e", "#8b939c"
+ACTIVE, DEACTIVATED, NOT_MATCHED = STATUS_COLOURS.values()
 MATCHED = "#8db7ea"
 ARROW = "#ffb000"
 _DARK_ROOM, _CONTRAST_LIMIT, _PARTS = 8.0, 3.0, 4

@@ -20,6 +20,7 @@ from qgis.core import (
     QgsMapLayer,
     QgsProject,
     QgsRasterLayer,
+    QgsRenderContext,
     QgsVectorLayer,
 )
 from qgis.PyQt.QtCore import QTimer
@@ -62,7 +63,7 @@ def described(layer: QgsMapLayer) -> dict[str, Any]:
 
 
 def classes_of(layer: QgsVectorLayer) -> dict[str, Any]:
-    """The number of features of a layer, and the kind and the classes of its renderer."""
+    """The number of features of a layer, the kind and the classes of its renderer, and what it draws."""
     renderer = layer.renderer()
     classes = []
     if renderer.type() == "graduatedSymbol":
@@ -74,6 +75,7 @@ def classes_of(layer: QgsVectorLayer) -> dict[str, Any]:
         "renderer": renderer.type(),
         "attribute": getattr(renderer, "classAttribute", str)(),
         "classes": classes,
+        "drawn": renderer.symbols(QgsRenderContext())[0].symbolLayer(0).layerType(),
     }
 
 

@@ -20,6 +20,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from scripts.make_plugin import write_plugin
+from services.conventions import STATUS_COLOURS
 from services.formats.vector.qgis_styles import COLOURS
 from tests.app.flat_world import CENTRE, GROUND_H, SIGMA_M, FlatWorld, make_flat_world
 from tests.service_process import Service, free_port
@@ -123,7 +124,7 @@ def test_qgis_applies_the_style_of_a_geopackage_of_points(in_qgis, url, secret, 
     path = tmp_path / "points.gpkg"
     headers = {"Authorization": f"Bearer {secret}"}
     items = f"{url}/collections/points/items?f=gpkg&limit=100"
-    path.write_bytes(httpx.get(items, headers=headers).raise_for_status().content)
+    path.write_bytes(httpx.get(items, headers=headers, timeout=60.0).raise_for_status().content)
     layer = in_qgis("styles_of_a_geopackage", path=str(path))
     assert layer["error"] == ""
     assert sorted(layer["styles"]) == ["Horizontal sigma", "Number of views"]
@@ -135,8 +136,7 @@ def assert_sigma_style(layer: dict[str, Any]) -> None:
     assert layer["renderer"] == "graduatedSymbol"
     assert layer["attribute"] == 'max("sigma_east_m", "sigma_north_m")'
     labels = ["up to 0.5 m", "up to 1 m", "up to 2 m", "up to 5 m", "over 5 m"]
-    colours = [f"#{bytes(map(int, colour.split(','))).hex()}" for colour in COLOURS]
-    assert layer["classes"] == [list(pair) for pair in zip(labels, colours, strict=True)]
+    assert layer["classes"] == [list(pair) for pair in zip(labels, COLOURS, strict=True)]
 
 
 def test_the_plugin_registers_the_active_raster_and_loads_it_where_it_lies(
@@ -159,7 +159,11 @@ def test_the_plugin_registers_the_active_raster_and_loads_it_where_it_lies(
     assert list(loaded) == ["control points", "residuals", f"scene at {GROUND_H:.0f} m"]
     points, residuals, on_map = loaded.values()
     assert all(layer["valid"] for layer in loaded.values())
-    assert {status for status, _ in points["classes"]} == {"active", "deactivated", "not matched"}
+    for layer in (points, residuals):
+        assert layer["renderer"] == "categorizedSymbol"
+        assert layer["attribute"] == "status"
+        assert layer["classes"] == [list(pair) for pair in STATUS_COLOURS.items()]
+    assert (points["drawn"], residuals["drawn"]) == ("SimpleMarker", "ArrowLine")
     assert 20 < residuals["features"] <= points["features"] <= POINTS
     assert on_map["crs"] == "EPSG:4326"
     # The delivered model is wrong by 14 lines and 9 samples.

@@ -151,5 +151,5 @@ def _file_bytes(features: FeatureTable, layer: str, driver: str, name: str, **op
             **options,
         )
         if driver == "GPKG" and layer in LAYER_STYLES:
-            add_styles(path, layer, LAYER_STYLES[layer])
+            add_styles(path, [layer])
         return path.read_bytes()

@@ -6,15 +6,18 @@ QGIS makes when it saves a style itself.
 """
 
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Literal, TypeAlias
 from xml.etree import ElementTree as ET
 
-COLOURS = ("68,1,84", "59,82,139", "33,145,140", "94,201,98", "253,231,37")
-"""Viridis: red, green, blue of the classes; readable with every colour vision."""
+from services.conventions import STATUS_COLOURS
+
+COLOURS = ("#440154", "#3b528b", "#21918c", "#5ec962", "#fde725")
+"""Viridis, of the classes of a number; readable with every colour vision."""
 TABLE = """
 CREATE TABLE layer_styles (
     id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL,
@@ -36,15 +39,15 @@ FROM gpkg_geometry_columns WHERE table_name = ?
 
 
 @dataclass(frozen=True)
-class Style:
-    """Points in classes of colour.
+class NumberStyle:
+    """Points in classes of a number.
 
     Attributes:
         name: as QGIS lists it.
         description: what the colours show.
-        expression: QGIS expression of the value that is classified.
+        expression: QGIS expression of the number.
         limits: of the classes, ascending, one more than there are colours.
-        unit: of the value, for the legend; "" for none.
+        unit: of the number, for the legend; "" for none.
     """
 
     name: str
@@ -54,47 +57,85 @@ class Style:
     unit: str
 
 
-LAYER_STYLES = {
+@dataclass(frozen=True)
+class WordStyle:
+    """Points, or arrows along lines, in classes of a word.
+
+    Attributes:
+        name: as QGIS lists it.
+        description: what the colours show.
+        attribute: with the word.
+        colours: by the word.
+        symbol: what is drawn.
+    """
+
+    name: str
+    description: str
+    attribute: str
+    colours: Mapping[str, str]
+    symbol: Literal["disc", "arrow"]
+
+
+Style: TypeAlias = NumberStyle | WordStyle
+
+LAYER_STYLES: Mapping[str, Sequence[Style]] = {
     "points": (
-        Style(
+        NumberStyle(
             "Horizontal sigma",
             "Standard deviation of the position in the frame of its block, the larger of east and north",
             'max("sigma_east_m", "sigma_north_m")',
             (0.0, 0.5, 1.0, 2.0, 5.0, 1e6),
             "m",
         ),
-        Style("Number of views", "Images that see the point", '"n_views"', (0, 2, 4, 6, 9, 1e6), ""),
-    )
+        NumberStyle(
+            "Number of views", "Images that see the point", '"n_views"', (0, 2, 4, 6, 9, 1e6), ""
+        ),
+    ),
+    "control_points": (
+        WordStyle("Status", "Whether the registration uses the point", "status", STATUS_COLOURS, "disc"),
+    ),
+    "residuals": (
+        WordStyle(
+            "Status",
+            "Observed minus computed, exaggerated; whether the registration uses the point",
+            "status",
+            STATUS_COLOURS,
+            "arrow",
+        ),
+    ),
 }
 """The styles of a layer by its name; QGIS applies the first."""
 
 
-def add_styles(path: Path, layer: str, styles: Sequence[Style]) -> None:
+def add_styles(path: Path, layers: Sequence[str]) -> None:
     """Add the table of styles to a GeoPackage.
 
     Args:
         path: of the file, which has no such table yet.
-        layer: of points.
-        styles: of the layer; QGIS applies the first.
+        layers: of the file, each with styles in `LAYER_STYLES`.
     """
     with closing(sqlite3.connect(path)) as database, database:
         database.execute(TABLE)
         database.execute(CONTENTS)
-        for number, style in enumerate(styles):
-            values = (style.name, as_qml(style), number == 0, style.description, layer)
-            database.execute(ROW, values)
+        for layer in layers:
+            for number, style in enumerate(LAYER_STYLES[layer]):
+                values = (style.name, as_qml(style), number == 0, style.description, layer)
+                database.execute(ROW, values)
 
 
 def as_qml(style: Style) -> str:
-    """The style as QGIS writes it: a renderer with one marker for each class."""
+    """The style as QGIS writes it: a renderer with one symbol for each class."""
     root = ET.Element("qgis", version="3.22", styleCategories="Symbology")
-    renderer = ET.SubElement(
-        root,
-        "renderer-v2",
-        type="graduatedSymbol",
-        attr=style.expression,
-        graduatedMethod="GraduatedColor",
-    )
+    if isinstance(style, NumberStyle):
+        _add_ranges(root, style)
+    else:
+        _add_categories(root, style)
+    return ET.tostring(root, encoding="unicode")
+
+
+def _add_ranges(root: ET.Element, style: NumberStyle) -> None:
+    how = {"type": "graduatedSymbol", "graduatedMethod": "GraduatedColor"}
+    renderer = ET.SubElement(root, "renderer-v2", how, attr=style.expression)
     ranges, symbols = ET.SubElement(renderer, "ranges"), ET.SubElement(renderer, "symbols")
     for number, (colour, (lower, upper)) in enumerate(zip(COLOURS, pairwise(style.limits), strict=True)):
         is_last = number == len(COLOURS) - 1
@@ -109,8 +150,40 @@ def as_qml(style: Style) -> str:
             label=f"{label} {style.unit}".rstrip(),
             render="true",
         )
-        symbol = ET.SubElement(symbols, "symbol", type="marker", name=str(number), alpha="1")
-        marker = ET.SubElement(symbol, "layer", {"class": "SimpleMarker"}, enabled="1", locked="0")
-        for key, value in (("name", "circle"), ("color", f"{colour},255"), ("size", "2")):
-            ET.SubElement(marker, "prop", k=key, v=value)
-    return ET.tostring(root, encoding="unicode")
+        _add_disc(symbols, str(number), colour)
+
+
+def _add_categories(root: ET.Element, style: WordStyle) -> None:
+    renderer = ET.SubElement(root, "renderer-v2", type="categorizedSymbol", attr=style.attribute)
+    categories, symbols = ET.SubElement(renderer, "categories"), ET.SubElement(renderer, "symbols")
+    add_symbol = _add_arrow if style.symbol == "arrow" else _add_disc
+    for number, (word, colour) in enumerate(style.colours.items()):
+        ET.SubElement(categories, "category", symbol=str(number), value=word, label=word, render="true")
+        add_symbol(symbols, str(number), colour)
+
+
+def _add_disc(symbols: ET.Element, name: str, colour: str) -> None:
+    symbol = ET.SubElement(symbols, "symbol", type="marker", name=name, alpha="1")
+    _add_layer(symbol, "SimpleMarker", {"name": "circle", "color": _channels(colour), "size": "2"})
+
+
+def _add_arrow(symbols: ET.Element, name: str, colour: str) -> None:
+    """A straight arrow from the first to the last vertex, millimetres."""
+    symbol = ET.SubElement(symbols, "symbol", type="line", name=name, alpha="1")
+    shape = {"is_curved": "0", "is_repeated": "0"}
+    size = {"arrow_width": "0.4", "arrow_start_width": "0.4", "head_length": "1.6"}
+    arrow = _add_layer(symbol, "ArrowLine", {**shape, **size, "head_thickness": "1"})
+    inside = ET.SubElement(arrow, "symbol", type="fill", name=f"@{name}@0", alpha="1")
+    _add_layer(inside, "SimpleFill", {"color": _channels(colour), "outline_style": "no"})
+
+
+def _add_layer(symbol: ET.Element, kind: str, properties: Mapping[str, str]) -> ET.Element:
+    layer = ET.SubElement(symbol, "layer", {"class": kind}, enabled="1", locked="0")
+    for key, value in properties.items():
+        ET.SubElement(layer, "prop", k=key, v=value)
+    return layer
+
+
+def _channels(colour: str) -> str:
+    """A colour `#rrggbb` as QGIS writes it: red, green, blue, opacity."""
+    return ",".join(map(str, (*bytes.fromhex(colour[1:]), 255)))

@@ -7,6 +7,7 @@ import numpy.typing as npt
 import shapely
 
 from services.formats.gcp.json_formats import measured_numbers
+from services.formats.vector.qgis_styles import add_styles
 from services.geodesy import metres_per_degree_at, wrapped_degrees
 from services.types import Measures
 
@@ -19,7 +20,7 @@ Fields = dict[str, npt.NDArray[np.generic]]
 
 
 def write_residual_layers(path: Path, measures: Measures, image: str, exaggeration: float) -> None:
-    """Write the layers `residuals` (3D lines) and `control_points` (3D points).
+    """Write the layers `residuals` (3D lines) and `control_points` (3D points), with styles for QGIS.
 
     A line starts at the control point and follows, at its height, the residual on the ground, observed
     minus computed, times the exaggeration, which is an attribute of each line. Only matched points have
@@ -42,6 +43,7 @@ def write_residual_layers(path: Path, measures: Measures, image: str, exaggerati
     line_fields = {name: values[has_residual] for name, values in fields.items()}
     _write(path, "residuals", "LineString Z", lines, {**line_fields, **stretch})
     _write(path, "control_points", "Point Z", shapely.points(measures.lon_lat_h), fields)
+    add_styles(path, ["residuals", "control_points"])
 
 
 def exaggeration_for(measures: Measures) -> float:

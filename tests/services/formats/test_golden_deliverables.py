@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -27,6 +28,7 @@ from services.formats.sensor_models.dimap import format_dimap_rpc, parse_dimap_r
 from services.formats.sensor_models.rpc_text import parse_rpc_text
 from services.formats.vector.residual_layers import write_residual_layers
 from services.map_grid import MapGrid
+from services.reports.drawing import ACTIVE, DEACTIVATED, NOT_MATCHED
 from services.sensors.correction import CorrectedModel
 from services.sensors.ortho import OrthoModel
 from services.sensors.rpc import RpcModel
@@ -230,5 +232,37 @@ def test_gdal_reads_both_layers_of_residuals_with_their_reference_system(tmp_pat
     assert {name: info["geometry_type"] for name, info in kinds.items()} == {
         "residuals": "LineString Z",
         "control_points": "Point Z",
+        "layer_styles": None,
     }
-    assert {info["crs"] for info in kinds.values()} == {"EPSG:4979"}
+    assert {kinds[name]["crs"] for name in ("residuals", "control_points")} == {"EPSG:4979"}
+
+
+def test_qgis_finds_arrows_of_residuals_in_the_colours_of_the_report(tmp_path: Path) -> None:
+    path = tmp_path / "residuals.gpkg"
+    write_residual_layers(path, measures(), "invented", RESIDUALS["exaggeration"])
+    with closing(sqlite3.connect(path)) as database:
+        columns = dict(database.execute("select table_name, column_name from gpkg_geometry_columns"))
+        styles = database.execute(
+            "select f_table_name, f_geometry_column, useAsDefault, styleQML from layer_styles"
+        ).fetchall()
+        assert database.execute("pragma integrity_check").fetchone() == ("ok",)
+    drawn = {}
+    for layer, column, is_default, qml in styles:
+        assert (columns[layer], 1) == (column, is_default)
+        renderer = ElementTree.fromstring(qml).find("renderer-v2")
+        assert renderer is not None
+        assert (renderer.get("type"), renderer.get("attr")) == ("categorizedSymbol", "status")
+        colours = [one.get("v") for one in renderer.iterfind(".//prop[@k='color']")]
+        words = [one.get("value") for one in renderer.iterfind("categories/category")]
+        kinds = {one.get("class") for one in renderer.iterfind("symbols/symbol/layer")}
+        drawn[layer] = kinds, dict(zip(words, colours, strict=True))
+    colours_of_the_report = {
+        word: ",".join(map(str, (*bytes.fromhex(colour[1:]), 255)))
+        for word, colour in zip(
+            ("active", "deactivated", "not matched"), (ACTIVE, DEACTIVATED, NOT_MATCHED), strict=True
+        )
+    }
+    assert drawn == {
+        "residuals": ({"ArrowLine"}, colours_of_the_report),
+        "control_points": ({"SimpleMarker"}, colours_of_the_report),
+    }

@@ -202,7 +202,11 @@ def test_residual_vectors_open_in_a_gis_with_heights_and_reference_system(
     exaggeration = exaggeration_for(measures)
     for _ in range(2):
         write_residual_layers(path, measures, "scene", exaggeration)
-    assert {name for name, _ in pyogrio.list_layers(path)} == {"residuals", "control_points"}
+    assert {name for name, _ in pyogrio.list_layers(path)} == {
+        "residuals",
+        "control_points",
+        "layer_styles",
+    }
     meta, _, geometry, values = pyogrio.raw.read(path, layer="residuals")
     assert meta["crs"] == "EPSG:4979"
     fields = dict(zip(meta["fields"], values, strict=True))
