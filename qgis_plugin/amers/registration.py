@@ -14,6 +14,11 @@ from .service import Service, ServiceError
 POLL_S = 1.0
 PIECE_BYTES = 8 << 20
 """Size of the pieces of an upload, between which progress is shown and a cancellation noticed."""
+MOST_BREAKS = 5
+"""Breaks after which an upload is given up when no byte arrived between them."""
+BREAKS = (0, 409, 423)
+"""Status of a broken connection: no reply, a piece that QGIS sent again, one that still arrives."""
+PAUSE_S = 1.0
 UPLOAD_PERCENT = 20.0
 """Share of the upload in the progress of a registration."""
 MODEL_SUFFIXES = (".txt", ".rpb", ".xml", ".dim", ".imd")
@@ -89,24 +94,47 @@ def model_files(image: Path) -> list[Path]:
 
 
 def _upload(service: Service, image: Path, sigma_m: float | None, progress: Progress) -> str:
-    """Send an image in pieces by tus 1.0; returns the id of the scene."""
+    """Send an image in pieces by tus 1.0; returns the id of the scene.
+
+    After a break, the service says how much has arrived, and only the rest is sent.
+    """
     size = image.stat().st_size
     values = {"filename": image.name, **({} if sigma_m is None else {"sigma_m": str(sigma_m)})}
     pairs = (f"{name} {b64encode(value.encode()).decode()}" for name, value in values.items())
     headers = {**TUS, "Upload-Length": str(size), "Upload-Metadata": ",".join(pairs)}
     created = service.post("uploads", b"", headers)
     place = "uploads/" + created["location"].rsplit("/", 1)[1]
+    arrived = breaks = 0
+    is_complete = False
     with image.open("rb") as file:
-        while file.tell() < size:
-            headers = {
-                **TUS,
-                "X-HTTP-Method-Override": "PATCH",
-                "Content-Type": "application/offset+octet-stream",
-                "Upload-Offset": str(file.tell()),
-            }
-            service.post(place, file.read(PIECE_BYTES), headers)
-            progress(UPLOAD_PERCENT * file.tell() / size)
+        while not is_complete:
+            try:
+                offset = int(service.head(place, TUS)["upload-offset"])
+                if offset > arrived:
+                    arrived, breaks = offset, 0
+                file.seek(offset)
+                piece = file.read(PIECE_BYTES)
+                # After a break, an empty piece completes a file whose bytes have all arrived.
+                _send_piece(service, place, offset, piece)
+                arrived, breaks = offset + len(piece), 0
+                is_complete = arrived == size
+            except ServiceError as error:
+                breaks += 1
+                if breaks > MOST_BREAKS or error.status not in BREAKS:
+                    raise
+                time.sleep(PAUSE_S)
+            progress(UPLOAD_PERCENT * arrived / size)
     return created["amers-scene"]
+
+
+def _send_piece(service: Service, place: str, offset: int, content: bytes) -> None:
+    headers = {
+        **TUS,
+        "X-HTTP-Method-Override": "PATCH",
+        "Content-Type": "application/offset+octet-stream",
+        "Upload-Offset": str(offset),
+    }
+    service.post(place, content, headers)
 
 
 def _download(service: Service, image: Path, job: str) -> Path:

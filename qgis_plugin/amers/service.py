@@ -48,11 +48,13 @@ class Service:
         """Send content; returns the headers of the reply by their names in lower case."""
         call = self._call()
         self._content(call, call.post(self._request(path, headers), QByteArray(content)))
-        reply = call.reply()
-        return {
-            bytes(name).decode().lower(): bytes(reply.rawHeader(name)).decode()
-            for name in reply.rawHeaderList()
-        }
+        return _headers(call)
+
+    def head(self, path: str, headers: dict[str, str]) -> dict[str, str]:
+        """The headers of a reply without content, by their names in lower case."""
+        call = self._call()
+        self._content(call, call.head(self._request(path, headers)))
+        return _headers(call)
 
     def put(self, path: str, content: bytes) -> Any:
         """Send a file; returns the JSON document of the reply."""
@@ -96,6 +98,14 @@ class Service:
             return content
         status = reply.attribute(QNetworkRequest.HttpStatusCodeAttribute) or 0
         raise ServiceError(f"{self.url}: {_detail(content) or call.errorMessage()}", status)
+
+
+def _headers(call: QgsBlockingNetworkRequest) -> dict[str, str]:
+    reply = call.reply()
+    return {
+        bytes(name).decode().lower(): bytes(reply.rawHeader(name)).decode()
+        for name in reply.rawHeaderList()
+    }
 
 
 def _detail(content: bytes) -> str:

@@ -202,6 +202,15 @@ def load_again(url: str, secret: str, image: str) -> dict[str, Any]:
     return {"loaded": loaded, "messages": messages()}
 
 
+def register_and_load(url: str, secret: str, image: str, sigma_m: float) -> dict[str, Any]:
+    set_service(url, store_token(secret))
+    iface.setActiveLayer(QgsProject.instance().addMapLayer(QgsRasterLayer(image, "raw scene")))
+    register_with(sigma_m)
+    groups = QgsProject.instance().layerTreeRoot().findGroups()
+    loaded = [node.layer().name() for group in groups for node in group.findLayers()]
+    return {"loaded": loaded, "messages": messages()}
+
+
 def cancel_a_registration(url: str, secret: str, image: str) -> dict[str, Any]:
     set_service(url, store_token(secret))
     plugin = plugins["amers"]

@@ -8,9 +8,13 @@ import os
 import re
 import shutil
 import signal
+import socket
+import socketserver
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Thread
 from typing import Any
 from zipfile import ZipFile
 
@@ -176,6 +180,63 @@ def test_the_plugin_registers_the_active_raster_and_loads_it_where_it_lies(
     again = in_qgis("load_again", url=url, secret=secret, image=str(image))
     assert again["loaded"] == list(loaded), again["messages"]
     assert again["messages"][0].startswith("scene.tif is registered")
+
+
+def test_an_upload_that_breaks_off_goes_on_where_it_was(in_qgis, url, secret, world, tmp_path):
+    image = image_with_model(world, tmp_path / "images")
+    size = image.stat().st_size
+    with breaking_once(url, after_bytes=size // 3) as (address, received):
+        seen = in_qgis(
+            "register_and_load", url=address, secret=secret, image=str(image), sigma_m=SIGMA_M
+        )
+    assert seen["messages"][0].startswith("scene.tif is registered"), seen["messages"]
+    offsets = [int(one) for one in re.findall(rb"(?i)upload-offset: (\d+)", b"".join(received))]
+    assert offsets[0] == 0
+    assert size // 4 < offsets[-1] < size // 2
+    headers = {"Authorization": f"Bearer {secret}"}
+    newest = httpx.get(f"{url}/scenes?limit=1", headers=headers).raise_for_status().json()["scenes"][0]
+    file = f"{url}/scenes/{newest['id']}/files/scene.tif"
+    assert httpx.get(file, headers=headers, timeout=60.0).content == image.read_bytes()
+
+
+@contextmanager
+def breaking_once(url: str, after_bytes: int) -> Iterator[tuple[str, list[bytearray]]]:
+    """A way to a service that closes the first connection when it has brought so many bytes.
+
+    Yields its address, and what each connection has brought.
+    """
+    service = httpx.URL(url)
+    received: list[bytearray] = []
+
+    class Way(socketserver.BaseRequestHandler):
+        def handle(self) -> None:
+            brought = bytearray()
+            is_first = not received
+            received.append(brought)
+            with socket.create_connection((service.host, service.port)) as there:
+                back = Thread(target=pass_on, args=(there, self.request))
+                back.start()
+                while content := self.request.recv(1 << 16):
+                    there.sendall(content)
+                    brought += content
+                    if is_first and len(brought) >= after_bytes:
+                        break
+                self.request.shutdown(socket.SHUT_RDWR)
+                there.shutdown(socket.SHUT_WR)
+                back.join()
+
+    def pass_on(source: socket.socket, target: socket.socket) -> None:
+        with suppress(OSError):
+            while content := source.recv(1 << 16):
+                target.sendall(content)
+            target.shutdown(socket.SHUT_RDWR)
+
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Way) as server:
+        Thread(target=server.serve_forever).start()
+        try:
+            yield f"http://127.0.0.1:{server.server_address[1]}", received
+        finally:
+            server.shutdown()
 
 
 def test_cancelling_the_task_dismisses_the_job(in_qgis, service, url, secret, world, tmp_path):
