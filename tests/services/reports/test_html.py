@@ -18,6 +18,7 @@ from services.reports.figure_data import Quicklook
 from services.reports.figures import FIGURES, figure_markup
 from services.reports.html import chip_uri, choose_comparisons, flat_options, format_html
 from services.reports.maps import coverage_map, residual_map
+from services.reports.numbers import metres, number
 from services.reports.plot import tick_words, ticks
 from services.types import Acquisition
 
@@ -104,6 +105,26 @@ def test_the_verdict_comes_first_with_the_numbers_that_cost_it(material):
     verdict = texts.index(made.registration.qualification.verdict)
     active = int(made.measures.active.sum())
     assert verdict < texts.index(f"Active points: {active}") < texts.index("The scene")
+
+
+def test_the_predicted_accuracy_stands_in_a_table_relative_first_then_on_the_earth(material):
+    report = material().report()
+    texts = [text for text in Page(format_html(report)).texts if text]
+    below = texts[texts.index("Predicted CE90") :]
+    predicted = report.predicted
+    assert below[1:11] == [
+        "Worst place",
+        "Over the image",
+        "Relative to the control points",
+        metres(predicted.worst_m),
+        number(predicted.worst_px, 2, "px"),
+        metres(predicted.overall_m),
+        number(predicted.overall_px, 2, "px"),
+        "On the Earth",
+        metres(predicted.on_the_earth_worst_m),
+        metres(predicted.on_the_earth_overall_m),
+    ]
+    assert predicted.worst_m > predicted.overall_m
 
 
 def test_a_good_page_lists_no_unmet_criterion(material):
