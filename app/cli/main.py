@@ -3,7 +3,6 @@
 import gc
 import signal
 import sys
-from importlib.metadata import version
 from types import FrameType
 from typing import Annotated, Any
 
@@ -37,6 +36,8 @@ app = typer.Typer(
 
 def _show_version(asked: bool) -> None:
     if asked:
+        from importlib.metadata import version  # a third of the start; only this option needs it
+
         typer.echo(version("amers"))
         raise typer.Exit
 
