@@ -1,26 +1,27 @@
 """The code blocks of README and guide: each is run by a test, or read with its reason given here.
 
-A block that is added to one of these documents fails a test until it stands in one of the lists.
-Every `amers` line of every block is parsed by its command, so that its options exist.
+A block that is added to one of these documents fails a test until it stands in one of the lists; those
+of `amers` commands in the guide are run by its journey. Every `amers` line of every block is parsed by
+its command, so that its options exist.
 """
 
 import ast
 import re
 import shlex
-from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 import typer
 from typer.main import get_command
 
 from app.cli.main import app
+from tests.documents import ROOT, blocks_of, command_lines
 
-ROOT = Path(__file__).parent.parent
 DOCUMENTS = ("README.md", "docs/guide.md")
 """Those of *Connect* are the recipes of the service, all of which its test runs or names."""
+BLOCKS = [block for document in DOCUMENTS for block in blocks_of(document)]
 DEMO = "tests/journeys/test_demo.py"
 FIRST_RUN = "test_the_first_run_of_the_readme_registers_the_scene_of_the_demo"
+GUIDE = "tests/journeys/test_guide.py::test_a_command_of_the_guide_runs_as_it_is_written"
 RUN = {
     ("README.md", ". .venv/bin/activate"): f"{DEMO}::{FIRST_RUN}",
     (
@@ -30,42 +31,18 @@ RUN = {
     ("README.md", "gdalinfo registered/scene.tif"): f"{DEMO}::test_gdal_reads_what_the_readme_makes",
     ("docs/guide.md", "from os import environ"): f"{DEMO}::test_the_python_of_the_guide_runs_as_it_is",
     ("docs/guide.md", "from pathlib import Path"): f"{DEMO}::test_the_python_of_the_guide_runs_as_it_is",
+    **{
+        block.key: GUIDE
+        for block in BLOCKS
+        if block.document == "docs/guide.md" and block.text.startswith("amers ")
+    },
 }
 """The test that runs a block, by document and first line of the block without its comment."""
 MAKE = "its targets set up a machine; what they start is run by other tests"
-FILES = "works on files of the reader's own; its options are parsed here"
 IDS = "has ids that replies give; the tests of the client and of the API send these requests"
 READ = {
     ("README.md", "make demo"): MAKE,
     ("docs/guide.md", "make demo"): MAKE,
-    **{
-        ("docs/guide.md", f"amers {line}"): FILES
-        for line in (
-            "production run --images IMG_1.TIF --images IMG_2.TIF --gsd-m 0.5,2 -o my-block",
-            "production ortho ortho.tif --dem dem.tif --vertical EGM2008 -o my-block",
-            "production points gcplib.txt --vertical EGM96 --images ortho.tif --point-sigma-m 6,10"
-            " -o my-block",
-            "production points gcp_db.json --chips chips/ --vertical EGM2008 --point-sigma-m 4,8"
-            " --frame-sigma-m 3 -o my-block",
-            "production select catalogue.ndjson --area country.geojson --since 2021-01-01"
-            " -o my-selection",
-            "production run --selection my-selection --spacing-m 1400 -o my-block",
-            "block ingest my-block --publish",
-            "block quality my-block --site airport.tif --control-site harbour.tif --site-sigma-m 0.5 \\",
-            "scene register scene.tif --sigma-m 50 -o registered",
-            "scene register-many scenes/ --block my-block -o registered",
-            "scene register scene.tif --reference ortho.tif --dem dem.tif --vertical EGM2008"
-            " -o registered",
-            "scene register scene.tif --check-points marks.geojson -o registered",
-            "block renew my-block --image scene.tif",
-            "scene ortho scene.tif --model registered/refined_RPC.TXT --dem dem.tif --vertical EGM2008"
-            " -o ortho.tif",
-            "vectors canvas scene.tif -o canvas.vrt",
-            "vectors project map.gpkg --scene scene.tif --registration registered --dem dem.tif"
-            " --vertical EGM2008 --clip -o on_image.gpkg",
-            "serve",
-        )
-    },
     ("docs/guide.md", 'AUTH="Authorization: Bearer $TOKEN"'): IDS,
     (
         "docs/guide.md",
@@ -74,36 +51,6 @@ READ = {
     ): IDS,
 }
 """Why a block is not run, by document and first line of the block without its comment."""
-
-
-class Block(NamedTuple):
-    """A code block of a document."""
-
-    document: str
-    language: str
-    text: str
-
-    @property
-    def key(self) -> tuple[str, str]:
-        """Document and first line without its comment."""
-        return self.document, self.text.partition("\n")[0].split("  #")[0].rstrip()
-
-
-BLOCKS = [
-    Block(name, language, text)
-    for name in DOCUMENTS
-    for language, text in re.findall(
-        r"^```(\w*)\n(.*?)^```$", (ROOT / name).read_text(), re.DOTALL | re.MULTILINE
-    )
-]
-
-
-def command_lines(text: str) -> list[list[str]]:
-    """The words of every `amers` command of a block, and of those inside `$( )`."""
-    joined = text.replace("\\\n", " ")
-    inner = re.findall(r"\$\((amers [^)]*)\)", joined)
-    lines = [line.replace("…", "FILE") for line in joined.splitlines() if line.startswith("amers ")]
-    return [shlex.split(line, comments=True)[1:] for line in (*lines, *inner)]
 
 
 def parse(words: list[str]) -> None:
