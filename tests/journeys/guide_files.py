@@ -16,7 +16,7 @@ from benchmarks._catalogue_files import write_catalogue
 from services.formats.vector.layers import VectorLayer, write_layer
 from services.sensors.rpc import RpcModel
 from services.types import Array, FloatImage
-from tests.app.flat_world import GROUND_H, FlatWorld, make_flat_world
+from tests.app.flat_world import GROUND_H, SIGMA_M, FlatWorld, make_flat_world
 from tests.app.joint_world import true_model, write_scene
 from tests.services.chip_bases import (
     CORNER_XY,
@@ -33,6 +33,9 @@ from tests.services.chip_bases import (
 
 CENTRE = (5.4, 43.6)
 """Longitude and latitude in the middle of the box that the guide asks for."""
+SIZE = 800
+"""Lines and samples of all images: pixels of 0.5 m."""
+ISLAND_PX = 80
 GEOID_M = 48.0
 """Height of the invented geoids."""
 SHIFTS_PX = {
@@ -71,15 +74,23 @@ class Ground:
 
 def write_guide_files(folder: Path) -> None:
     """Write all files of the reader that the commands of the guide name, but for bases of points."""
-    world = make_flat_world(folder / "world")
+    world = make_flat_world(folder / "world", SIZE)
     model = replace(world.true_model, ground_offset=np.array([*CENTRE, GROUND_H]))
-    ground = Ground(folder, world.ground, model, replace(world, true_model=model))
+    pixels = _islands(world.ground)
+    ground = Ground(folder, pixels, model, replace(world, true_model=model, ground=pixels))
     _write_images(ground)
     _write_maps(ground)
     _write_drawings(ground)
     write_catalogue(simulate_catalogue(60, 120.0, np.random.default_rng(2)), folder)
     (folder / "items.ndjson").rename(folder / "catalogue.ndjson")
     (folder / "country.geojson").write_text(shapely.to_geojson(shapely.box(14.8, -0.2, 15.2, 0.2)))
+
+
+def _islands(pixels: FloatImage) -> FloatImage:
+    """The ground with texture in islands only, so that a block of it has few points."""
+    wave = np.sin(np.pi * (np.arange(SIZE) + 0.5) / ISLAND_PX)
+    contrast = (np.outer(wave, wave) ** 8).astype(np.float32)
+    return 1500.0 + contrast * (pixels - 1500.0)
 
 
 def write_bases(folder: Path) -> None:
@@ -102,12 +113,13 @@ def write_geoids(folder: Path) -> None:
 
 
 def _write_images(ground: Ground) -> None:
-    """Write raw images, every second of them seen from the south."""
+    """Write raw images, every second of them seen from the south; their models state their accuracy."""
     rng = np.random.default_rng(31)
     (ground.folder / "scenes").mkdir()
     for number, (name, shift_px) in enumerate(SHIFTS_PX.items()):
         model = true_model(ground.world, "south" if number % 2 else "east")
-        write_scene(ground.folder / name, model, shift_px, ground.pixels, rng)
+        stated = replace(model, error_bias_m=SIGMA_M, error_random_m=0.0)
+        write_scene(ground.folder / name, stated, shift_px, ground.pixels, rng)
 
 
 def _write_maps(ground: Ground) -> None:
@@ -140,8 +152,8 @@ def _write_drawings(ground: Ground) -> None:
     """Write marks of check points, a road on the raw scene, a map with a field, and a lake."""
     truth = true_model(ground.world, "east")
     marks = []
-    for line in range(200, 1001, 200):
-        for sample in range(200, 1001, 200):
+    for line in range(100, SIZE, 140):
+        for sample in range(100, SIZE, 140):
             lon_lat_h = ground.place(line, sample)
             seen = truth.project(np.array([lon_lat_h]))[0]
             marks.append(
@@ -152,15 +164,15 @@ def _write_drawings(ground: Ground) -> None:
                 }
             )
     _write_json(ground.folder / "marks.geojson", {"type": "FeatureCollection", "features": marks})
-    road = shapely.LineString([(300.0, -300.0), (500.0, -420.0), (800.0, -900.0)])
+    road = shapely.LineString([(200.0, -200.0), (300.0, -420.0), (620.0, -640.0)])
     write_layer(
         ground.folder / "roads.gpkg", VectorLayer("roads", np.array([road]), _names("D 7"), None)
     )
-    corners = [ground.place(*corner)[:2] for corner in ((500, 500), (500, 700), (700, 700), (700, 500))]
+    corners = [ground.place(*corner)[:2] for corner in ((400, 400), (400, 500), (500, 500), (500, 400))]
     field = VectorLayer("map", np.array([shapely.Polygon(corners)]), _names("meadow"), "EPSG:4326")
     write_layer(ground.folder / "map.gpkg", field)
     lake = shapely.Polygon(
-        [ground.place(*corner)[:2] for corner in ((550, 550), (550, 590), (590, 590))]
+        [ground.place(*corner)[:2] for corner in ((450, 450), (450, 490), (490, 490))]
     )
     (ground.folder / "lakes.geojson").write_text(shapely.to_geojson(lake))
 
