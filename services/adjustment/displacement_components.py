@@ -36,7 +36,7 @@ BENDS: dict[Kind, int] = {"quadratic": 2, "cubic": 3}
 
 MAX_CHANCE = 0.002
 """Structure that chance explains with a larger probability is not looked into."""
-_MOST_COMPONENTS = 3
+_MOST_COMPONENTS = 6
 _MOST_POINTS = 200
 """Measures that choose a kernel; more cost more and tell little more."""
 _ROUNDS = 2

