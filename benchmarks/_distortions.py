@@ -167,8 +167,8 @@ def distortion_of(
         _smooth(drawn, shape, rng),
         _steps(drawn, shape, rng),
         _moved(drawn, shape, gsd_m, rng) if drawn.moved_share > 0.0 else None,
-        _seams(drawn, shape, rng) if drawn.kind in SEAMS else (),
         TURNS.get(drawn.kind, ""),
+        _seams(drawn, shape, rng) if drawn.kind in SEAMS else (),
     )
 
 

@@ -151,16 +151,16 @@ class Distortion:
         smooth: displacements that add up.
         steps: in the order of their lines. The middle line stays in its place.
         moved: ground that is elsewhere.
-        seams: along each axis in their order. The middle of the image stays in its place.
         turn: "swapped" lines and samples, "mirrored" along samples, "upside down" along lines.
+        seams: along each axis in their order. The middle of the image stays in its place.
     """
 
     shape: tuple[int, int]
     smooth: tuple[Displacement, ...] = ()
     steps: tuple[Step, ...] = ()
     moved: MovedGround | None = None
-    seams: tuple[Seam, ...] = ()
     turn: Turn = ""
+    seams: tuple[Seam, ...] = ()
 
     @property
     def is_none(self) -> bool:
