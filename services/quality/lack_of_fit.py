@@ -158,6 +158,8 @@ def missed_criterion(
 ) -> Criterion:
     """The criterion on lines, or samples, whose points do not agree, where those of others do.
 
+    Of samples, points that were found count alone: haze or water may hide a side of an image.
+
     Args:
         along: of what.
         position: (n,) line or sample where the points are expected.
@@ -167,7 +169,8 @@ def missed_criterion(
         shown: (n,) points whose chips no break of the image cuts; all when None.
     """
     name = f"missed_along_{along}"
-    tried = active | np.isin(reason, (*UNFOUND, "deactivated"))
+    disagree = (*UNFOUND, "deactivated") if along == "lines" else ("deactivated",)
+    tried = active | np.isin(reason, disagree)
     if shown is not None:
         tried &= shown | active
     missed = missed_along(position, active, tried)

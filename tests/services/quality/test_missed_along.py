@@ -77,6 +77,13 @@ def test_a_detector_whose_points_do_not_agree_is_named_by_its_samples() -> None:
     assert "a detector is out of place" in criterion.note
 
 
+def test_a_side_of_the_image_whose_points_are_not_found_accuses_no_detector() -> None:
+    sample = np.linspace(0.0, LINES - 1.0, 240)
+    hazy = sample >= 1200.0
+    criterion = missed_criterion("samples", sample, ~hazy, np.where(hazy, "low_score", ""), LINES)
+    assert criterion.met
+
+
 def test_lost_lines_reach_to_the_border_that_no_point_is_beyond() -> None:
     line = np.linspace(100.0, LINES - 101.0, 240)
     lost = line >= 1700.0
