@@ -1,8 +1,8 @@
-"""Lines whose points were missed, searched again farther out.
+"""Lines and samples whose points were missed, searched again farther out.
 
 The last search reaches a few pixels. Where lines were lost or repeated, or the sensor swings by
-more, all points of some lines lie beyond it, while those of other lines are found. Clouds hide points;
-they do not move them.
+more, all points of some lines lie beyond it, while those of other lines are found; so do those of the
+samples of a detector that is out of place. Clouds hide points; they do not move them.
 """
 
 from dataclasses import replace
@@ -25,7 +25,7 @@ _FEWEST = 4
 def search_missed_lines(
     context: PointContext, prediction: Prediction, search: Search, adjustment: SceneAdjustment
 ) -> tuple[Search, SceneAdjustment]:
-    """The search and its adjustment with the points of missed lines, where they are found farther out.
+    """The search and its adjustment with the points of missed lines and samples found farther out.
 
     Args:
         context: of the registration.
@@ -33,10 +33,12 @@ def search_missed_lines(
         search: the last one.
         adjustment: on it.
     """
-    line = prediction.model.project(search.points.lon_lat_h)[:, 0]
+    expected = prediction.model.project(search.points.lon_lat_h)
     reason = search.matches.reason
     unfound = np.isin(reason, UNFOUND)
-    missed = missed_along(line, adjustment.active, unfound | (reason == ""))
+    tried = unfound | (reason == "")
+    missed = missed_along(expected[:, 0], adjustment.active, tried)
+    missed |= missed_along(expected[:, 1], adjustment.active, tried)
     rows = np.flatnonzero(missed & unfound)
     rows = rows[:: -(-len(rows) // _MOST) or 1]
     if len(rows) < _FEWEST:
