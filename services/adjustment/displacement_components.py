@@ -36,7 +36,8 @@ BENDS: dict[Kind, int] = {"quadratic": 2, "cubic": 3}
 
 MAX_CHANCE = 0.002
 """Structure that chance explains with a larger probability is not looked into."""
-_MOST_COMPONENTS = 6
+_MOST_COMPONENTS, _MOST_WITH_SEAMS = 3, 6
+"""Components, and those with the seams between detectors, which are many where there is one."""
 _MOST_POINTS = 200
 """Measures that choose a kernel; more cost more and tell little more."""
 _ROUNDS = 2
@@ -103,6 +104,11 @@ class Component:
     def is_step(self) -> bool:
         """Whether it displaces all that lies behind a line, or sample, alike."""
         return self.kind in ("step", "break")
+
+    @property
+    def is_seam(self) -> bool:
+        """Whether it is a step along the samples."""
+        return self.kind == "step" and self.along == "samples"
 
     def polynomial(self, line_sample: Array) -> Array:
         """Value (...) of a bend at positions (..., 2), 1 at the last line or sample."""
@@ -181,12 +187,14 @@ def likeliest_components(
     affine = found = structures(residuals, families)
     while True:
         clearest = min(found, key=lambda one: one.chance)
-        if clearest.chance > MAX_CHANCE or len(components) == _MOST_COMPONENTS:
+        if clearest.chance > MAX_CHANCE or len(components) == _MOST_WITH_SEAMS:
             break
         followed = with_components(residuals, components)
         thinned = _thinned(followed)
         best = _System.of(thinned).best(_candidates(thinned, found, followed_by))
         if best.component is None or best.log_evidence <= _LEAST_EVIDENCE:
+            break
+        if len(components) >= _MOST_COMPONENTS and not best.component.is_seam:
             break
         richer = with_components(followed, [best.component])
         blocks = _blocks(residuals, best.component)

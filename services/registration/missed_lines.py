@@ -14,6 +14,7 @@ from services.matching.control_points import ChipSearch, match_points, with_matc
 from services.quality.missed_along import UNFOUND, missed_along
 from services.registration.context import PointContext, Prediction
 from services.registration.search import Search, adjust_search, select_inliers
+from services.types import IntArray
 
 _RADIUS_PX = 128
 """Search radius, pixels of the chips."""
@@ -25,7 +26,10 @@ _FEWEST = 4
 def search_missed_lines(
     context: PointContext, prediction: Prediction, search: Search, adjustment: SceneAdjustment
 ) -> tuple[Search, SceneAdjustment]:
-    """The search and its adjustment with the points of missed lines and samples found farther out.
+    """The search and its adjustment with the points of missed lines or samples found farther out.
+
+    Points of samples are taken if more agree with them: ground that moved in the middle of an image
+    hides its samples, too.
 
     Args:
         context: of the registration.
@@ -36,13 +40,24 @@ def search_missed_lines(
     expected = prediction.model.project(search.points.lon_lat_h)
     reason = search.matches.reason
     unfound = np.isin(reason, UNFOUND)
-    tried = unfound | (reason == "")
-    missed = missed_along(expected[:, 0], adjustment.active, tried)
-    missed |= missed_along(expected[:, 1], adjustment.active, tried)
-    rows = np.flatnonzero(missed & unfound)
+    for axis in (0, 1):
+        missed = missed_along(expected[:, axis], adjustment.active, unfound | (reason == ""))
+        farther = _found_farther(context, prediction, search, np.flatnonzero(missed & unfound))
+        if farther is None:
+            continue
+        again = adjust_search(context.scene, farther, context.options.adjustment)
+        if axis == 0 or again.active.sum() > adjustment.active.sum():
+            return farther, again
+    return search, adjustment
+
+
+def _found_farther(
+    context: PointContext, prediction: Prediction, search: Search, rows: IntArray
+) -> Search | None:
+    """The search with points of it that are found farther out; None where hardly any is."""
     rows = rows[:: -(-len(rows) // _MOST) or 1]
     if len(rows) < _FEWEST:
-        return search, adjustment
+        return None
     chip_search = ChipSearch(
         context.image,
         prediction.model,
@@ -53,8 +68,7 @@ def search_missed_lines(
     points = search.points.take(rows)
     again = match_points(chip_search, points, context.chips, context.options.matching)
     if (again.reason == "").sum() < _FEWEST:
-        return search, adjustment
+        return None
     matches = with_matches(search.matches, rows, again)
     inliers, _ = select_inliers(prediction.model, search.points, matches)
-    farther = replace(search, matches=matches, inliers=inliers)
-    return farther, adjust_search(context.scene, farther, context.options.adjustment)
+    return replace(search, matches=matches, inliers=inliers)
