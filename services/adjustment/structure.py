@@ -28,8 +28,8 @@ ALONG_AXES: tuple[Family, ...] = ("lines", "steps", "samples", "seams")
 OTHERWISE: tuple[Family, ...] = ("image", "height")
 _OF_PLACES: tuple[Family, ...] = (*ALONG_AXES, "image")
 """Families that say how far off a place is; what depends on height is another model's."""
-_EXPECTED = 0.05
-"""A priori probability that an image moves in some way of a family."""
+_EXPECTED, _EXPECTED_SEAMS = 0.05, 0.01
+"""A priori probability that an image moves in some way of a family, and that it has a seam."""
 
 _LEAST_POINTS = 12
 """Fewer residuals show no structure."""
@@ -223,8 +223,10 @@ def _beyond_height_errors(residuals: Residuals) -> Residuals:
     return replace(residuals, misfit=residuals.misfit - explained)
 
 
-def probability_of_structure(chance: float) -> float:
+def probability_of_structure(chance: float, expected: float = _EXPECTED) -> float:
     """Probability that a structure is more than chance, from the chance of one that is as clear.
+
+    `expected` is its probability a priori.
 
     A chance of p makes a structure at most 1 / (-e p log p) times more likely than none. Source: Sellke,
     Bayarri and Berger (2001), Calibration of p values for testing precise null hypotheses.
@@ -232,7 +234,7 @@ def probability_of_structure(chance: float) -> float:
     if chance >= np.exp(-1.0):
         return 0.0
     against = -np.e * max(chance, 1e-300) * np.log(max(chance, 1e-300))
-    return float(1.0 / (1.0 + against * (1.0 - _EXPECTED) / _EXPECTED))
+    return float(1.0 / (1.0 + against * (1.0 - expected) / expected))
 
 
 def unfollowed_variance_px2(found: Sequence[Structure], of_image: Array) -> Array:
@@ -247,7 +249,7 @@ def unfollowed_variance_px2(found: Sequence[Structure], of_image: Array) -> Arra
             directions may be an error of the points.
     """
     parts = [
-        probability_of_structure(one.chance)
+        probability_of_structure(one.chance, _EXPECTED_SEAMS if one.family == "seams" else _EXPECTED)
         * np.nan_to_num(one.size_px) ** 2
         * (of_image if one.family == "image" else 1.0)
         for one in found

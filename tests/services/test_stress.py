@@ -88,7 +88,6 @@ def registration_of(trial: Trial, block: Block) -> Registration:
     )
 
 
-@pytest.mark.endurance
 def test_no_delivered_scene_has_a_larger_error_than_stated(hard: list, clear: list) -> None:
     assert not [trial.number for trial, outcome in hard + clear if outcome.delivered and outcome.wrong]
 
