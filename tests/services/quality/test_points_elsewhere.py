@@ -109,3 +109,13 @@ def test_a_round_area_that_moved_is_neither() -> None:
             group = Elsewhere(np.flatnonzero(moved), np.array([4.0, -6.0]), 5.0, 1e-9)
             criterion = elsewhere_criterion(group, line_sample, ~moved, (1000, 1000))
             assert criterion.needed_for == "good", criterion.note
+
+
+@pytest.mark.parametrize("few", [3, 5])
+def test_a_few_points_that_a_pattern_displaces_alike_do_not_break_an_image(few: int) -> None:
+    """Fields and vineyards repeat themselves: points all over the image may agree on the next row."""
+    for seed in range(20):
+        line_sample = np.random.default_rng([few, seed]).uniform(0.0, 999.0, (120, 2))
+        group = Elsewhere(np.arange(few), np.array([4.0, -6.0]), 5.0, 1e-9)
+        criterion = elsewhere_criterion(group, line_sample, np.arange(120) >= few, (1000, 1000))
+        assert criterion.needed_for == "good", criterion.note
