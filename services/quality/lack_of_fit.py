@@ -51,10 +51,10 @@ _WHY_MISSED = {
 _LARGE_PART = 0.4
 """Share of the image to which points that agree elsewhere are nearest, beyond which neither place is the
 scene's."""
-_AMONG, _PART_AMONG = 0.3, 0.15
-"""Share of the active points between points that agree elsewhere, and of the image to which these are
-nearest, beyond which the image has two places. A few that a pattern of the ground displaces are nearest
-to less."""
+_AMONG, _AS_MANY = 0.3, 0.1
+"""Share of the active points between points that agree elsewhere, and number of these over the active
+ones, beyond which the image has two places. A pattern of the ground displaces a few; of those that were
+missed, 24 are searched again."""
 _CHANCE_OF_SAMPLES = 0.01
 """Of points drawn at random being those of whole samples, at most, to be taken for these."""
 _NODES = 30
@@ -260,13 +260,13 @@ def _broken_by(some: Array, others: Array, displacement_px: Array, shape: tuple[
             f"hardly any others lie between their samples, {sample.min():.0f} to {sample.max():.0f}: a "
             "detector is out of place, or the image was put together from parts"
         )
-    part = _nearest_share(some, others, shape)
     among = float(np.mean(shapely.contains_xy(shapely.MultiPoint(some).convex_hull, others)))
-    if among > _AMONG and part > _PART_AMONG:
+    if among > _AMONG and len(some) > _AS_MANY * len(others):
         return (
             f"{among:.0%} of the others lie between them: detectors that alternate, or an image put "
             "together from parts, so that neither place is the scene's"
         )
+    part = _nearest_share(some, others, shape)
     if part > _LARGE_PART:
         return f"{_MOVED}; they are nearest to {part:.0%} of the image: neither place is the scene's"
     return ""
