@@ -254,8 +254,8 @@ def _broken_by(some: Array, others: Array, displacement_px: Array, shape: tuple[
             "belong to another image"
         )
     sample, samples_of_others = some[:, 1], others[:, 1]
-    by_chance = chance_of_whole_lines(sample, samples_of_others)
-    if are_whole_lines(sample, samples_of_others) and by_chance <= _CHANCE_OF_SAMPLES:
+    by_chance = chance_of_contiguous(sample, samples_of_others)
+    if are_contiguous(sample, samples_of_others) and by_chance <= _CHANCE_OF_SAMPLES:
         return (
             f"hardly any others lie between their samples, {sample.min():.0f} to {sample.max():.0f}: a "
             "detector is out of place, or the image was put together from parts"
@@ -290,26 +290,24 @@ def _belong_to_whole_lines(line: Array, others: Array, displacement_px: Array) -
     along = abs(displacement_px[1]) <= _ALONG * abs(displacement_px[0])
     ordered = np.sort(line)
     parts = [ordered, ordered[1:], ordered[:-1]] if along and len(line) >= _ENOUGH else [ordered]
-    return any(are_whole_lines(part, others) for part in parts)
+    return any(are_contiguous(part, others) for part in parts)
 
 
-def chance_of_whole_lines(line: Array, others: Array) -> float:
-    """Chance that n of all n + m points, drawn at random, are those of whole lines, at most.
-
-    The same is that of whole samples, and so for `are_whole_lines`.
-    """
-    places = int(len(line) + max(1.0, _WITHIN * len(line)))
-    total = len(line) + len(others)
+def chance_of_contiguous(position: Array, others: Array) -> float:
+    """Chance that n of all n + m points, drawn at random, are contiguous, at most."""
+    n = len(position)
+    places = int(n + max(1.0, _WITHIN * n))
+    total = n + len(others)
     if places >= total:
         return 1.0
-    windows = (total - places + 1) * float(comb(places, len(line)))
-    return min(windows / float(comb(total, len(line))), 1.0)
+    windows = (total - places + 1) * float(comb(places, n))
+    return min(windows / float(comb(total, n)), 1.0)
 
 
-def are_whole_lines(line: Array, others: Array) -> bool:
-    """Whether hardly any of the other points (m,) lie between the lines (n,) of points."""
-    between = int(((others >= line.min()) & (others <= line.max())).sum())
-    return between <= max(1.0, _WITHIN * len(line))
+def are_contiguous(position: Array, others: Array) -> bool:
+    """Whether hardly any other points (m,) lie between points (n,), by their lines or their samples."""
+    between = int(((others >= position.min()) & (others <= position.max())).sum())
+    return between <= max(1.0, _WITHIN * len(position))
 
 
 def _looks_like(structure: Structure, sight: Array, shape: tuple[int, int]) -> str:

@@ -14,7 +14,7 @@ from services.matching.consensus import Voters, a_contrario_consensus, consensus
 from services.matching.control_points import ChipSearch, PointMatches, match_points, with_matches
 from services.matching.height_consensus import height_consensus
 from services.matching.predict import spread_over_image
-from services.quality.lack_of_fit import Elsewhere, are_whole_lines, chance_of_whole_lines
+from services.quality.lack_of_fit import Elsewhere, are_contiguous, chance_of_contiguous
 from services.quality.missed_along import UNFOUND
 from services.registration.context import PointContext, Prediction
 from services.registration.search import (
@@ -173,9 +173,9 @@ def _lines_beside(
     group = a_contrario_consensus(misfit_px[left], tolerance_px, farthest_px)
     members = left[group.inliers]
     line, others = expected[members, 0], expected[adjustment.active, 0]
-    if len(members) < _FEWEST or not are_whole_lines(line, others):
+    if len(members) < _FEWEST or not are_contiguous(line, others):
         return None
-    false_alarms = group.false_alarms * chance_of_whole_lines(line, others)
+    false_alarms = group.false_alarms * chance_of_contiguous(line, others)
     if false_alarms > _MAX_FALSE_ALARMS:
         return None
     return Elsewhere(

@@ -20,7 +20,7 @@ from services.registration.chip_selection import fine_gsd_m
 from services.registration.coarse import needs_coarse_search, search_coarsely
 from services.registration.context import PointContext, Prediction, RegistrationContext, SearchStage
 from services.registration.elsewhere import adjust_with_places
-from services.registration.missed_lines import search_missed_lines
+from services.registration.missed_points import search_missed_points
 from services.registration.options import RegistrationOptions
 from services.registration.point_results import point_results
 from services.registration.point_selection import initial_prediction, points_to_try, visible_points
@@ -166,7 +166,7 @@ def search_scene(
         search = _match(part, prediction, rows)
         adjustment = adjust_search(scene, search, options.adjustment)
         prediction = predict(scene, points, adjustment)
-    return context, *search_missed_lines(context, prediction, search, adjustment)
+    return context, *search_missed_points(context, prediction, search, adjustment)
 
 
 def _match(context: PointContext, prediction: Prediction, rows: IntArray) -> Search:

@@ -6,8 +6,8 @@ import pytest
 from services.quality.criteria import Criterion
 from services.quality.lack_of_fit import (
     Elsewhere,
-    are_whole_lines,
-    chance_of_whole_lines,
+    are_contiguous,
+    chance_of_contiguous,
     elsewhere_criterion,
 )
 
@@ -71,8 +71,8 @@ def test_points_drawn_at_random_are_seldom_of_whole_lines(n: int, m: int) -> Non
     draws, seen = 20_000, 0
     for _ in range(draws):
         line = rng.permutation(n + m).astype(float)
-        seen += are_whole_lines(line[:n], line[n:])
-    stated = chance_of_whole_lines(np.arange(float(n)), np.arange(float(m)))
+        seen += are_contiguous(line[:n], line[n:])
+    stated = chance_of_contiguous(np.arange(float(n)), np.arange(float(m)))
     assert seen / draws <= stated + 3.0 * np.sqrt(stated / draws)
     assert seen / draws >= stated / 4.0
 

@@ -23,7 +23,7 @@ _MOST = 40
 _FEWEST = 4
 
 
-def search_missed_lines(
+def search_missed_points(
     context: PointContext, prediction: Prediction, search: Search, adjustment: SceneAdjustment
 ) -> tuple[Search, SceneAdjustment]:
     """The search and its adjustment with the points of missed lines or samples found farther out.
