@@ -108,6 +108,12 @@ def test_modules_of_tests_have_names_of_their_own():
     assert sorted(set(names)) == sorted(names)
 
 
+def test_a_module_of_tests_states_its_marks_once():
+    """A second list would replace the first: its tests would be run, or left out, against their marks."""
+    for path in (ROOT / "tests").rglob("test_*.py"):
+        assert len(re.findall(r"^pytestmark\b", path.read_text(), re.MULTILINE)) <= 1, path
+
+
 @pytest.mark.parametrize("path", TOUR)
 def test_a_stop_of_the_tour_exists_and_the_readme_leads_to_it(path):
     assert (ROOT / path).is_file()

@@ -20,9 +20,7 @@ from tests.app.bystander import Bystander, bystander
 from tests.app.running_service import Served, service_with_a_block
 from tests.factories import make_block
 
-pytestmark = pytest.mark.security
-
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.security, pytest.mark.long]
 
 POINTS = 2_100
 """More features than are built as one text, so that they are streamed."""

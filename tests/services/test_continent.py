@@ -29,9 +29,7 @@ from services.simulation.archive import (
 from services.simulation.conditions import clouds_over
 from services.types import Array
 
-pytestmark = pytest.mark.endurance
-
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.endurance]
 
 SEEDS = range(60)
 a_tenth_of_a_pixel = 0.1

@@ -38,9 +38,7 @@ from services.simulation.tiles import TiledView
 from services.simulation.view import ViewPlan, plan_geometry
 from services.types import Array, ControlPoints, Frame
 
-pytestmark = pytest.mark.endurance
-
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.endurance]
 
 FRAME_M = np.array([1.6, -1.1, 2.3])
 FRAME = Frame.from_sigmas(1.5, 2.5)
