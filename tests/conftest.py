@@ -19,8 +19,9 @@ gc.disable()
 settings.register_profile("amers", deadline=None)
 settings.load_profile("amers")
 
-# Read by the linear algebra when NumPy is first imported, which is after this file.
-for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+# Read by the linear algebra when NumPy is first imported, which is after this file, and by OpenCV: the
+# processes of the tests are more than the cores.
+for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     os.environ.setdefault(_threads, "1")
 
 

@@ -270,6 +270,7 @@ def test_a_registration_is_used_by_its_job_and_its_scene(
     assert me.refusal("orthorectify", scene=scenes["south"], **inputs)[0] == 422
 
 
+@pytest.mark.endurance
 def test_a_scene_joins_those_of_an_earlier_job(
     me: Caller,
     stranger: Caller,

@@ -163,6 +163,7 @@ def test_rigorous_scenes_and_an_rpc_are_registered_in_one_block(
         assert words in text
 
 
+@pytest.mark.endurance
 def test_a_rigorous_scene_joins_a_block_with_rigorous_scenes(
     world: FlatWorld, folder: Path, two: tuple[Done, Path], tmp_path: Path
 ) -> None:

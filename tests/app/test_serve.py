@@ -57,7 +57,9 @@ def lasting(open_folder: Path) -> Iterator[Service]:
         yield service
 
 
-@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "ending", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.endurance)]
+)
 def test_a_stopped_service_stops_its_worker_and_its_database(service, ending):
     workers = service.workers()
     service.process.send_signal(ending)

@@ -96,6 +96,7 @@ def test_a_refusal_of_a_scene_too_large_for_the_map_names_the_middle_that_was_se
     assert stages[0].middle_m == pytest.approx(20_008.0)
 
 
+@pytest.mark.endurance
 def test_a_crop_of_other_ground_is_refused_with_how_far_was_searched() -> None:
     points, chips = wide_points(6_500.0, 440.0, (2.0,))
     with pytest.raises(NoConsensus, match=r"far search .* tried within 50\d\d m") as refused:
