@@ -15,7 +15,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.linalg import null_space, solve_triangular
+from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dpstrf
+from scipy.special import eval_legendre
 
 from services.adjustment.structure import ALONG_AXES, Family, Residuals, Structure, structures
 from services.types import Array, IntArray
@@ -68,6 +70,8 @@ _FINE = 8
 """Periods tried around a peak, for each that independent residuals tell apart."""
 _OF_POINTS = 2.0
 """Mean square of what displaces an ortho-image over the variance of its points, more than is theirs."""
+_NEGLIGIBLE = 1e-10
+"""Share of the variance of a component that its factor may leave out."""
 _ISOTROPIC = (0.05, 0.1, 0.2)
 """Lengths of errors that neighbours share in all directions, sides of the image: what else may be."""
 
@@ -113,7 +117,7 @@ class Component:
     def polynomial(self, line_sample: Array) -> Array:
         """Value (...) of a bend at positions (..., 2), 1 at the last line or sample."""
         unit = (line_sample[..., self.axes.start] - self.at_px) / self.length_px
-        return np.asarray(np.polynomial.legendre.Legendre.basis(BENDS[self.kind])(unit))
+        return np.asarray(eval_legendre(BENDS[self.kind], unit))
 
     def share(self, line_sample: Array) -> Array:
         """Share (...) of its variance at positions (..., 2): before a step there is none."""
@@ -379,52 +383,44 @@ class _System:
     Attributes:
         place: (n, 2) line and sample.
         lower: (2, n, n) Cholesky factors of the covariance.
-        rest: (2, n, n - k) bases of what the design leaves.
-        left: (2, n - k) measures in them.
+        bases: (2, n, k) of the design.
+        left: (2, n) measures without what it explains.
         unit_px2: (2,) median variance of a measure.
     """
 
     place: Array
     lower: Array
-    rest: Array
+    bases: Array
     left: Array
     unit_px2: Array
 
     @classmethod
     def of(cls, residuals: Residuals) -> "_System":
-        lower, _, _ = residuals.whitened
-        rest, left = [], []
-        for k in range(2):
-            columns = np.column_stack([residuals.design, residuals.misfit[:, k]])
-            white = solve_triangular(lower[k], columns, lower=True, check_finite=False)
-            basis = null_space(white[:, :-1].T, rcond=1e-9)
-            rest.append(basis)
-            left.append(basis.T @ white[:, -1])
         diagonal = np.diagonal(residuals.covariance, 0, 1, 2)
-        return cls(
-            residuals.line_sample, lower, np.array(rest), np.array(left), np.median(diagonal, axis=1)
-        )
+        return cls(residuals.line_sample, *residuals.whitened, np.median(diagonal, axis=1))
 
     def best(self, candidates: Sequence[Component]) -> _Judged:
         """The most likely of some components, with its likeliest variances."""
         judged = [self.judge(one, one.correlation(self.place, self.place)) for one in candidates]
         return max(judged, key=lambda one: one.log_evidence, default=_Judged(None, 0.0))
 
-    def judge(self, component: Component | None, correlation: Array, most: float = np.inf) -> _Judged:
-        """The likeliest variances of a component with this correlation (n, n), and its evidence.
-
-        Variances are `most` times the median variance of the measures, at most.
-        """
-        ratio = _RATIOS[most >= _RATIOS, None]
+    def judge(self, component: Component | None, correlation: Array) -> _Judged:
+        """The likeliest variances of a component with this correlation (n, n), and its evidence."""
+        factor = _low_rank(correlation)
+        ratio = _RATIOS[:, None]
         quadratic, determinant = [], []
         for k in range(2):
-            half = solve_triangular(self.lower[k], correlation, lower=True, check_finite=False)
-            white = solve_triangular(self.lower[k], half.T, lower=True, check_finite=False)
-            values, vectors = np.linalg.eigh(self.rest[k].T @ white @ self.rest[k] * self.unit_px2[k])
+            white = solve_triangular(self.lower[k], factor, lower=True, check_finite=False)
+            white -= self.bases[k] @ (self.bases[k].T @ white)
+            values, vectors = np.linalg.eigh(white.T @ white * self.unit_px2[k])
             spread = 1.0 + ratio * np.maximum(values, 0.0)
-            quadratic.append(((vectors.T @ self.left[k]) ** 2 / spread).sum(axis=1))
+            explained = ((self.left[k] @ white @ vectors) ** 2 * self.unit_px2[k] * ratio / spread).sum(
+                axis=1
+            )
+            quadratic.append(self.left[k] @ self.left[k] - explained)
             determinant.append(np.log(spread).sum(axis=1))
-        freedom = self.left.size
+        _, n, fixed = self.bases.shape
+        freedom = 2 * (n - fixed)
         total = quadratic[0][:, None] + quadratic[1][None, :]
         logarithm = -0.5 * (determinant[0][:, None] + determinant[1][None, :])
         logarithm = logarithm - 0.5 * freedom * np.log(np.maximum(total, 1e-300))
@@ -438,3 +434,11 @@ class _System:
             evidence -= float(np.log(len(self.place)))
         variance = np.array([_RATIOS[first], _RATIOS[second]]) * self.unit_px2
         return _Judged(replace(component, variance_px2=variance), evidence)
+
+
+def _low_rank(correlation: Array) -> Array:
+    """A factor (n, r) of a correlation (n, n), by its product with itself: steps have an r of 1."""
+    lower, order, rank, _ = dpstrf(correlation, tol=_NEGLIGIBLE, lower=1)
+    factor = np.zeros((len(correlation), rank))
+    factor[order - 1] = np.tril(lower)[:, :rank]
+    return factor
