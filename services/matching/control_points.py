@@ -9,7 +9,7 @@ from services.adjustment.short_motion import ChipStrips
 from services.conventions import CHIP_CENTRE
 from services.geodesy import move_metres
 from services.imagery.gaps import bridged, missing_reason
-from services.imagery.source import ImageSource, ReducedImage, image_gsd_m, low_pass, render_chip
+from services.imagery.source import ImageSource, ReducedImage, image_gsds_m, low_pass, render_chip
 from services.matching.chip_extent import central_square, visible_half_side
 from services.matching.chip_strips import chip_strips
 from services.matching.correlate import (
@@ -133,7 +133,6 @@ class _PointMatch:
         views: (k,) numbers of the views tried, within the point.
         peaks: of these views.
         by_gradient: whether the peaks are those of gradients.
-        scene_gsd_m: ground sampling of the scene at the point, metres.
         statistics: (squares, 2) of the scene around the point, see `patch_statistics`.
     """
 
@@ -141,7 +140,6 @@ class _PointMatch:
     views: IntArray
     peaks: list[Peak]
     by_gradient: bool
-    scene_gsd_m: float
     statistics: Array
 
 
@@ -168,6 +166,7 @@ def match_points(
         points, search.gsd_m, search.acquisition, options.max_views, options.view_distance
     )
     shifts = [shadow_shift(image, search.acquisition, search.gsd_m) for image in points.views.images]
+    gsds_m = image_gsds_m(search.model, points.lon_lat_h)
     matches = [_not_searched("")] * len(points)
     order = _tile_order(search.model.project(points.lon_lat_h))
     for count, row in enumerate(order):
@@ -189,12 +188,11 @@ def match_points(
             (stored[view], shifts[image])
             for view, image in zip(views, points.views.image[view_rows], strict=True)
         ]
-        scene_gsd_m = image_gsd_m(search.model, points.lon_lat_h[row])
-        peaks, combination, by_gradient = _match_point(search, patch, candidates, scene_gsd_m, options)
-        matches[row] = _PointMatch(
-            combination, views, peaks, by_gradient, scene_gsd_m, patch_statistics(patch)
+        peaks, combination, by_gradient = _match_point(
+            search, patch, candidates, float(gsds_m[row]), options
         )
-    return _assembled(search, points, matches, order)
+        matches[row] = _PointMatch(combination, views, peaks, by_gradient, patch_statistics(patch))
+    return _assembled(search, points, matches, gsds_m, order)
 
 
 def with_matches(matches: PointMatches, rows: IntArray, again: PointMatches) -> PointMatches:
@@ -221,9 +219,7 @@ def with_matches(matches: PointMatches, rows: IntArray, again: PointMatches) -> 
 
 
 def _not_searched(reason: str) -> _PointMatch:
-    return _PointMatch(
-        no_measure(0, reason), np.zeros(0, dtype=np.int64), [], False, np.nan, np.empty((0, 2))
-    )
+    return _PointMatch(no_measure(0, reason), np.zeros(0, dtype=np.int64), [], False, np.empty((0, 2)))
 
 
 def _predicted_patch(search: ChipSearch, lon_lat_h: Array) -> FloatImage:
@@ -277,9 +273,21 @@ def _match_point(
 
 
 def _assembled(
-    search: ChipSearch, points: ControlPoints, matches: list[_PointMatch], order: Sequence[int]
+    search: ChipSearch,
+    points: ControlPoints,
+    matches: list[_PointMatch],
+    gsds_m: Array,
+    order: Sequence[int],
 ) -> PointMatches:
-    """The matches of all points, in the rows of the points; `order` is that of the search."""
+    """The matches of all points, in the rows of the points.
+
+    Args:
+        search: see `match_points`.
+        points: the same.
+        matches: of the points.
+        gsds_m: (n,) ground sampling of the scene at the points.
+        order: of the search.
+    """
     n = len(points)
     row_col = np.array([match.combination.row_col for match in matches]).reshape(-1, 2)
     displacement_m = np.column_stack([row_col[:, 1] * search.gsd_m, -row_col[:, 0] * search.gsd_m])
@@ -292,7 +300,7 @@ def _assembled(
     return PointMatches(
         line_sample=search.model.project(measured),
         displacement_m=displacement_m,
-        sigma_px=sigma_m / np.array([match.scene_gsd_m for match in matches]),
+        sigma_px=sigma_m / gsds_m,
         score=np.array([_best_score(match.peaks) for match in matches]),
         views=np.array([match.combination.agreeing.sum() for match in matches], dtype=np.int64),
         reason=reason,

@@ -47,11 +47,11 @@ class DisplacementGrid:
         side of its middle.
         """
         offsets = np.linspace(-0.5, 0.5, _AVERAGED) * side
-        along_lines = [self.at(self._before_breaks(line_sample, offset)) for offset in offsets]
-        along_samples = [self.at(line_sample + [0.0, offset]) for offset in offsets]
-        return np.asarray(
-            np.mean(along_lines, axis=0) + np.mean(along_samples, axis=0) - self.at(line_sample)
-        )
+        along_lines = [self._before_breaks(line_sample, offset) for offset in offsets]
+        along_samples = [line_sample + [0.0, offset] for offset in offsets]
+        places = np.concatenate([*along_lines, *along_samples])
+        means = self.at(places).reshape(2, _AVERAGED, -1, 2).mean(axis=1)
+        return np.asarray(means[0] + means[1] - self.at(line_sample))
 
     def _before_breaks(self, line_sample: Array, offset: float) -> Array:
         """Positions (n, 2) some lines away, or at the break that lies between."""
