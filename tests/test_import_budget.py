@@ -1,6 +1,5 @@
 """What a command may import before it works: every package of others costs tenths of a second."""
 
-import json
 import os
 import subprocess
 import sys
@@ -11,19 +10,10 @@ import pytest
 from app.cli import commands
 from app.cli.on_demand import Command, Tree
 from app.one_thread import ONE_THREAD
+from tests.imports import COMMAND, CONNECTION, LISTING, PACKAGES, beyond_budget, imported_by
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = frozenset(
-    """
-    alembic cql2 cv2 fastapi geoalchemy2 httpx importlib.metadata jinja2 matplotlib numba numpy obstore
-    pandas procrastinate prometheus_client psycopg pyarrow pydantic_settings pyogrio pyproj rasterio
-    scipy scipy.spatial scipy.stats shapely sqlalchemy uvicorn
-    """.split()  # noqa: SIM905
-)
-"""What takes long to import."""
-CONNECTION = frozenset({"importlib.metadata", "psycopg", "pydantic_settings", "sqlalchemy"})
-"""What the settings and a connection need."""
-STORE = CONNECTION | {"geoalchemy2", "numpy", "shapely"}
+STORE = CONNECTION | {"geoalchemy2", "numpy", "shapely", "sqlalchemy"}
 """What the tables and a connection to them need."""
 BUDGETS = {
     "--version": {"importlib.metadata"},
@@ -32,67 +22,24 @@ BUDGETS = {
     "serve --help": CONNECTION,
     "token list --help": STORE,
     "audit --help": STORE,
-    "block list --help": STORE,
+    "block list --help": LISTING,
     "block publish --help": STORE,
     # The jobs are done by other processes, which a warm server of the worker forks.
     "worker --help": STORE | {"procrastinate"},
     # Without the statistics of scipy: a third of the time that its start takes.
     "scene register --help": PACKAGES - {"scipy.stats", "fastapi", "matplotlib", "pandas", "uvicorn"},
 }
-PROGRAM = """
-import atexit, json, sys
-
-class Importers:
-    "Notes which file first imports a package."
-    first = {}
-
-    def find_spec(self, name, path=None, target=None):
-        if name not in self.first:
-            frame = sys._getframe(1)
-            while frame and "importlib" in frame.f_code.co_filename:
-                frame = frame.f_back
-            self.first[name] = f"{frame.f_code.co_filename}:{frame.f_lineno}" if frame else ""
-
-sys.meta_path.insert(0, Importers())
-atexit.register(lambda: print(json.dumps(Importers.first)))
-"""
-COMMAND = "from app.cli.main import main; main()"
-
-
-def imported_by(statement: str, words: str = "") -> dict[str, str]:
-    """The modules that a statement imports, each with the line that imported it first.
-
-    Args:
-        words: arguments of the program.
-    """
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM + statement, *words.split()],
-        cwd=ROOT,
-        env=os.environ,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    first: dict[str, str] = json.loads(done.stdout.splitlines()[-1])
-    return first
 
 
 @pytest.mark.parametrize("words", BUDGETS)
 def test_a_command_imports_no_more_than_its_budget(words):
-    imported = imported_by(COMMAND, words)
-    beyond = {
-        name: line for name, line in imported.items() if name in PACKAGES and name not in BUDGETS[words]
-    }
+    beyond = beyond_budget(imported_by(COMMAND, words), BUDGETS[words])
     assert beyond == {}, f"amers {words} imports what it does not need; see who asks for it first"
 
 
 def test_the_python_client_imports_nothing_of_weight_but_httpx():
     imported = imported_by("import app.client")
-    assert {
-        name: line
-        for name, line in imported.items()
-        if name in PACKAGES - {"httpx", "importlib.metadata"}
-    } == {}
+    assert beyond_budget(imported, {"httpx", "importlib.metadata"}) == {}
     assert "httpx" in imported
 
 

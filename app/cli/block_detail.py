@@ -5,7 +5,7 @@ from app.cli.block_renewal import renewal_row
 from app.cli.output import AsJson, print_json, show_one
 from app.cli.transaction import transaction
 from app.usecases.blocks import lifecycle
-from app.usecases.blocks.listing import block_extent
+from app.usecases.blocks.lookup import block_extent
 from app.usecases.blocks.renewal import find_renewal
 from services.quality.accuracy_statement import accuracy_document
 

@@ -5,8 +5,8 @@ from typing import Annotated
 import typer
 
 from app.cli.output import AsJson, Row, show
-from app.cli.transaction import transaction
-from app.db.blocks import Block
+from app.cli.reading import reading
+from app.db.block_list import BlockSummary
 from app.usecases.blocks import listing
 from services.quality.accuracy_statement import accuracy_document
 
@@ -15,14 +15,16 @@ Reference = Annotated[str, typer.Argument(help="Number of the block, its ID, or 
 
 def list_blocks(as_json: AsJson = False) -> None:
     """List all blocks, the newest first."""
-    with transaction() as connection:
+    with reading() as connection:
         blocks = listing.list_blocks(connection)
-        stated = listing.stated_accuracies(connection, [block.number for block in blocks])
-    shown = {number: accuracy_document(one) if as_json else one.words for number, one in stated.items()}
-    show([{**block_row(block), **shown[block.number]} for block in blocks], as_json=as_json)
+    rows: list[Row] = [
+        {**block_row(block), **(accuracy_document(stated) if as_json else stated.words)}
+        for block, stated in blocks
+    ]
+    show(rows, as_json=as_json)
 
 
-def block_row(block: Block) -> Row:
+def block_row(block: BlockSummary) -> Row:
     """The properties of a block, by their names."""
     return {
         "number": block.number,

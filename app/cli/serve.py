@@ -19,8 +19,8 @@ import typer
 from app import logs
 from app.cli.supervisor import Child, Supervisor
 from app.config import Settings, read_settings
-from app.db import revisions
 from app.db.cluster import embedded
+from app.db.ready import ready_database
 from app.errors import InputError, PortInUse
 
 BACKLOG = 2048
@@ -49,8 +49,7 @@ def serve(
         close = stack.enter_context(ExitStack())
         for listener in listeners:
             close.enter_context(listener)
-        dsn = stack.enter_context(embedded.database(settings))
-        revisions.ensure_schema(dsn, upgradable=settings.database_url is None)
+        stack.enter_context(ready_database(settings))
         with database_watched(settings):
             supervisor.run(_children(listeners, worker), at_stop=close.close)
     if supervisor.exit_code:

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from app.config import Settings, read_settings
-from app.db import engine, revisions
-from app.db.cluster import embedded
+from app.db import engine
 from app.db.engine import Connection
+from app.db.ready import ready_database
 
 
 @contextmanager
@@ -17,7 +17,5 @@ def transaction(settings: Settings | None = None) -> Iterator[Connection]:
         InputError: the database cannot be used; the message says what to do.
     """
     chosen = settings or read_settings()
-    with embedded.database(chosen) as dsn:
-        revisions.ensure_schema(dsn, upgradable=chosen.database_url is None)
-        with engine.connect(dsn) as connection:
-            yield connection
+    with ready_database(chosen) as dsn, engine.connect(dsn) as connection:
+        yield connection

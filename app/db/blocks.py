@@ -1,8 +1,7 @@
 """Blocks: a version of points, published or not as a whole, with its images and files of chips."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -25,13 +24,13 @@ from sqlalchemy import (
 )
 from sqlalchemy.dialects.postgresql import JSONB
 
+from app.db.block_list import BlockSummary
 from app.db.constants import text_constant
 from app.db.engine import Connection
 from app.db.rows import among, columns_of
 from app.db.schema import BlockState, block, chip_file, now, point
 from app.db.schema.base import Double
-from services.formats.block.frame_json import parse_frame
-from services.types import Array, Frame, IntArray, SurfaceHeights
+from services.types import Array, IntArray, SurfaceHeights
 
 ID_BITS = 26
 """A point's id is the number of its block times 2^26 plus its id in the block."""
@@ -50,31 +49,15 @@ INGESTION_LOCK = 0x616D657273
 
 
 @dataclass(frozen=True)
-class Block:
+class Block(BlockSummary):
     """One version of a block.
 
     Attributes:
-        number: of this version in this database.
-        id, version: the names of its producer.
-        priority: where blocks overlap, the points of the block with the greater priority are served.
-        n_unserved: how many of its points are not served: a better block has them, or they are
-            suspended.
-        outline: (m, 2) lon, lat, not closed.
         checksum: sha256 of its block.json.
+        outline: (m, 2) lon, lat, not closed.
     """
 
-    number: int
-    id: str
-    version: str
-    title: str
-    state: BlockState
-    priority: int
-    n_points: int
-    n_unserved: int
-    n_views: int
     checksum: str
-    created_at: datetime
-    state_changed_at: datetime
     outline: Array
 
 
@@ -116,38 +99,6 @@ def find_blocks(connection: Connection, reference: str) -> list[Block]:
         )
     )
     return _blocks(connection.execute(statement.order_by(block.c.number)))
-
-
-def list_blocks(connection: Connection, states: tuple[BlockState, ...]) -> list[Block]:
-    """The blocks in some states, the newest first."""
-    statement = select(*COLUMNS).where(block.c.state.in_(states)).order_by(block.c.number.desc())
-    return _blocks(connection.execute(statement))
-
-
-@dataclass(frozen=True)
-class StatedSigmas:
-    """What the accuracy of a block follows from.
-
-    Attributes:
-        horizontal_m, up_m: standard deviations of its median point, a coordinate, in its frame.
-        frame: on the Earth.
-    """
-
-    horizontal_m: float
-    up_m: float
-    frame: Frame
-
-
-def stated_sigmas(connection: Connection, numbers: Sequence[int]) -> dict[int, StatedSigmas]:
-    """The stated sigmas of some blocks, by their numbers."""
-    horizontal_m = block.c.quality["sigma_horizontal_m", "median"].as_float()
-    up_m = block.c.quality["sigma_up_m", "median"].as_float()
-    statement = select(block.c.number, horizontal_m, up_m, FRAME, FRAME_SIGMA_M)
-    rows = connection.execute(statement.where(block.c.number.in_(numbers)))
-    return {
-        number: StatedSigmas(horizontal, up, parse_frame(frame, sigma_m))
-        for number, horizontal, up, frame, sigma_m in rows
-    }
 
 
 def find_document(connection: Connection, number: int) -> str:

@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from sqlalchemy.schema import CreateIndex, CreateTable, DDLElement
 
 from app.db.schema import metadata
-from app.db.statements import DIALECT, sql_file
+from app.db.sql_files import sql_file
+from app.db.statements import DIALECT
 
 EXTENSION = "create extension if not exists postgis;\n"
 

@@ -36,8 +36,8 @@ from sqlalchemy.pool import ConnectionPoolEntry, PoolProxiedConnection
 from app import request_context
 from app.config import Settings
 from app.db.address import unreachable
-from app.db.cluster import embedded
-from app.db.revisions import DriverConnection, driver_connection, ensure_schema
+from app.db.ready import ready_database
+from app.db.revisions import DriverConnection, driver_connection
 
 Connection = sqlalchemy.Connection
 
@@ -114,19 +114,15 @@ class Database:
 
 @contextmanager
 def opened(settings: Settings) -> Iterator[Database]:
-    """The installation's database, ready for use: running, with the schema of this Amers, pools warm.
-
-    The schema of the private cluster is upgraded on the way; that of a database of your own is not.
+    """The installation's database, ready for use, its pools warm.
 
     Raises:
         InputError: the database cannot be used; the message says what to do.
     """
-    with embedded.database(settings) as dsn:
-        # First: the schema grants what the role of the reading connections needs.
-        ensure_schema(dsn, upgradable=settings.database_url is None)
-        with pooled(dsn, settings) as database:
-            _warm_pools(database, min(WARM_CONNECTIONS, settings.pool_size))
-            yield database
+    # Its schema grants what the role of the reading connections needs.
+    with ready_database(settings) as dsn, pooled(dsn, settings) as database:
+        _warm_pools(database, min(WARM_CONNECTIONS, settings.pool_size))
+        yield database
 
 
 @contextmanager

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import psycopg
-from sqlalchemy import Connection, text
 
 from app.db.address import unreachable
+from app.db.sql_files import sql_file
 from app.errors import InputError
 
 DriverConnection = psycopg.Connection[tuple[Any, ...]]
@@ -35,14 +35,14 @@ def status(dsn: str) -> SchemaStatus:
     with driver_connection(dsn) as connection:
         found = None
         if connection.execute("select to_regclass('alembic_version')").fetchone() != (None,):
-            found = connection.execute("select version_num from alembic_version").fetchone()
-    return SchemaStatus(found=found[0] if found else None, needed=newest_revision())
+            found = current(connection)
+    return SchemaStatus(found=found, needed=newest_revision())
 
 
-def current(connection: Connection) -> str | None:
+def current(connection: DriverConnection) -> str | None:
     """The version of the schema of a database that has tables of Amers."""
-    revision: str | None = connection.scalar(text("select version_num from alembic_version"))
-    return revision
+    found = connection.execute("select version_num from alembic_version").fetchone()
+    return None if found is None else str(found[0])
 
 
 def ensure_schema(dsn: str, *, upgradable: bool) -> None:
@@ -90,7 +90,7 @@ def newest_revision() -> str:
     return max(_revisions())
 
 
-def require_current(connection: Connection) -> None:
+def require_current(connection: DriverConnection) -> None:
     """Refuse to work on a database that was upgraded while this process ran.
 
     Raises:
@@ -122,8 +122,6 @@ def _refuse_foreign(state: SchemaStatus) -> None:
 
 def _grant_reading(dsn: str) -> None:
     """Let the reading role read all tables, those of later migrations too."""
-    from app.db.statements import sql_file
-
     with driver_connection(dsn) as connection:
         connection.execute(sql_file("grants.sql").encode())
 

@@ -12,13 +12,14 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from importlib import resources
 from typing import Any
 
 from sqlalchemy import ClauseElement, Dialect, Select, Table, TextClause, text
 from sqlalchemy.dialects import postgresql
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.compiler import SQLCompiler
+
+from app.db.sql_files import sql_file
 
 DIALECT: Dialect = postgresql.psycopg.dialect()  # type: ignore[no-untyped-call]
 KEPT_STRUCTURES = 64
@@ -112,11 +113,6 @@ def _copy_out(element: CopyOut, compiler: SQLCompiler, **options: Any) -> str:
 def named(file: str, name: str) -> TextClause:
     """One statement of a file of `app/db/sql`."""
     return text(_statements(file)[name])
-
-
-def sql_file(name: str) -> str:
-    """The text of a file of `app/db/sql`."""
-    return resources.files("app.db").joinpath("sql", name).read_text()
 
 
 @cache

@@ -99,7 +99,7 @@ def overall(parts: dict[str, Part]) -> Literal["ready", "degraded", "not ready"]
 
 
 def _schema(connection: Connection) -> Part:
-    found, needed = revisions.current(connection), revisions.newest_revision()
+    found, needed = revisions.current(engine.driver(connection)), revisions.newest_revision()
     if found == needed:
         return OK
     return Part(

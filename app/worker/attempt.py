@@ -16,7 +16,7 @@ from psycopg import OperationalError
 
 from app.config import Settings
 from app.db import revisions
-from app.db.engine import Database
+from app.db.engine import Database, driver
 from app.db.jobs import attempts
 from app.db.jobs.attempts import LostJob
 from app.db.jobs.jobs import Job
@@ -73,7 +73,7 @@ class Attempts:
         """
         with self.database.transaction() as connection:
             # The sweep of a worker that fits the database queues the ticket again.
-            revisions.require_current(connection)
+            revisions.require_current(driver(connection))
             job = attempts.claim_next(
                 connection,
                 self.worker,

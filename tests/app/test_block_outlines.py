@@ -15,7 +15,7 @@ from app.db.blocks import ID_BITS, Block
 from app.db.engine import Connection
 from app.storage import Storage
 from app.usecases.blocks import lifecycle
-from app.usecases.blocks.listing import block_extent
+from app.usecases.blocks.lookup import block_extent
 from services.formats.block.writer import write_block
 from services.types import Array
 from tests.factories import affine_model, control_points, metadata, noise_chips

@@ -13,7 +13,7 @@ from app.config import Settings
 from app.db import engine, revisions
 from app.db.cluster import embedded
 from app.db.cluster.embedded import CREATE_DATABASE, DATABASE, ROLE, SUPERUSER, Cluster
-from app.db.statements import sql_file
+from app.db.sql_files import sql_file
 from app.errors import InputError
 from app.main import create_app
 from app.usecases.tokens import create_token

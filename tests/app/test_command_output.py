@@ -16,6 +16,7 @@ from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from app.usecases.tokens import create_token, revoke_token
 from tests.command_line import amers_here
 from tests.factories import make_block
+from tests.imports import COMMAND, LISTING, beyond_budget, imported_by
 from tests.statements import run_sql
 
 NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -64,6 +65,13 @@ def test_the_extent_of_a_block_is_a_box_that_a_query_takes(run):
     assert shown["extent"] == ",".join(f"{value:.6f}" for value in box)
     found = run("points", "query", "--bbox", shown["extent"], "--format", "csv").splitlines()
     assert len(found) == 1 + int(shown["points"]) == 6
+
+
+def test_blocks_are_listed_within_the_budget_of_imports(run, dsn, tmp_path):
+    imported = imported_by(
+        COMMAND, "block list", AMERS_DATABASE_URL=dsn, AMERS_DATA_FOLDER=str(tmp_path)
+    )
+    assert beyond_budget(imported, LISTING) == {}, "see who asks for it first"
 
 
 def test_names_in_json_have_no_blanks(run):

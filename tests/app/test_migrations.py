@@ -15,7 +15,7 @@ from pydantic import SecretStr
 
 from app.config import Settings
 from app.db import engine, revisions
-from app.db.cluster import backup
+from app.db.cluster import backup, embedded
 from app.db.revisions import SchemaStatus
 from app.errors import Conflict, InputError
 from app.usecases.tokens import create_token, list_tokens
@@ -56,7 +56,7 @@ def test_an_empty_database_gets_the_tables_of_the_store_and_the_queue(empty_dsn)
 
 
 def test_whoever_opens_a_new_database_reads_as_a_reader_at_once(empty_dsn, monkeypatch, tmp_path):
-    monkeypatch.setattr(engine.embedded, "database", lambda settings: nullcontext(empty_dsn))
+    monkeypatch.setattr(embedded, "database", lambda settings: nullcontext(empty_dsn))
     with engine.opened(Settings(data_folder=tmp_path)) as database, database.reading() as connection:
         row = run_sql(connection, "select current_user as who").fetchone()
     assert row["who"] == engine.READER

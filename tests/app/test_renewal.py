@@ -15,14 +15,14 @@ from typer.testing import CliRunner
 from app.cli.main import app as amers
 from app.config import Settings
 from app.db import engine
-from app.db.blocks import list_blocks
-from app.db.engine import Connection, Database
+from app.db.engine import Connection, Database, driver
 from app.db.jobs.attempts import LostJob
 from app.db.points import points_of_block
 from app.db.renewal import StoredSearches
 from app.errors import Conflict
 from app.storage import Storage
 from app.usecases.blocks import lifecycle
+from app.usecases.blocks.listing import list_blocks
 from app.usecases.blocks.renewal import read_base, renew_block, stage_renewal
 from app.usecases.blocks.renewing_scenes import scene_of_image
 from app.usecases.damage import open_chips
@@ -282,7 +282,7 @@ def test_scenes_that_cannot_renew_a_block_are_refused_by_name(
     connection.commit()
     twice = refused([*renew, "flat", "--image", image, "--image", image])
     assert f"{image.name}: the block has views of an image {image.stem} already" in twice
-    assert {block.id: block.state for block in list_blocks(connection, ("staged", "published"))} == {
+    assert {block.id: block.state for block, _ in list_blocks(driver(connection))} == {
         "flat": "published",
         "other": "published",
     }
@@ -344,7 +344,7 @@ def test_an_interrupted_renewal_leaves_nothing(
     for step in ("storing chips", "loading images", "loading rows"):
         with pytest.raises(LostJob, match=step), database.transaction() as transaction:
             stage_renewal(transaction, storage, base, work / "block", interrupted_at(step))
-    assert [block.version for block in list_blocks(connection, ("staged", "published"))] == ["1"]
+    assert [block.version for block, _ in list_blocks(driver(connection))] == ["1"]
     connection.commit()
     remove_unnamed_chips(connection, Bin(storage, limited=False))
     assert set(stored_files(storage)) == files_before
@@ -407,7 +407,7 @@ def test_an_administrator_renews_a_block_by_a_job(
     results = client.get(f"/jobs/{job['jobID']}/results", headers=admin).json()
     assert (results["id"], results["version"], results["state"]) == ("flat", "2", "staged")
     with database.reading() as connection:
-        assert [block.priority for block in list_blocks(connection, ("staged", "published"))] == [3, 3]
+        assert [block.priority for block, _ in list_blocks(driver(connection))] == [3, 3]
     document = client.get(results["renewal.json"]["href"], headers=admin).json()
     assert document["new_views"] == results["new_views"]
     # All points get views, not only the ninety that the registration tried.

@@ -28,6 +28,7 @@ from psycopg.pq import PGconn, Ping
 from app.config import Settings
 from app.db.address import check_address
 from app.db.cluster.binaries import ServerUser, find_binaries, run_as, server_user
+from app.db.sql_files import sql_file
 from app.errors import InputError
 
 ROLE = "amers_app"
@@ -161,8 +162,6 @@ class Cluster:
         Raises:
             InputError: somebody else uses tables whose owner changes.
         """
-        from app.db.statements import sql_file
-
         options = f"-c lock_timeout={LOCK_SECONDS:g}s"
         try:
             with psycopg.connect(self.dsn(name, SUPERUSER), options=options) as connection:

@@ -8,18 +8,7 @@ The tables of the queue belong to procrastinate and are not described here.
 """
 
 from app.db.schema.access import audit, installation, token, uptime
-from app.db.schema.base import (
-    BlockState,
-    JobResponse,
-    JobState,
-    SceneState,
-    UploadPurpose,
-    clock,
-    hours,
-    metadata,
-    now,
-    uptime_s,
-)
+from app.db.schema.base import clock, hours, metadata, now, uptime_s
 from app.db.schema.integrity import damaged_file, result_file
 from app.db.schema.jobs import job, job_message, job_turn, scene, upload
 from app.db.schema.points import block, chip_file, density_cell, image, point, view
@@ -32,6 +21,7 @@ from app.db.schema.registrations import (
     view_history,
     view_measure,
 )
+from app.db.states import BlockState, JobResponse, JobState, SceneState, UploadPurpose
 
 __all__ = [
     "BlockState",

@@ -1,18 +1,12 @@
 """What the tables share: the metadata with its names of constraints, types, defaults and choices."""
 
 from datetime import timedelta
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 from geoalchemy2 import Geometry
 from sqlalchemy import CheckConstraint, ColumnElement, Computed, DateTime, Interval, MetaData, func
 from sqlalchemy import column as column_named
 from sqlalchemy.dialects.postgresql import DOUBLE_PRECISION, JSONB, REAL
-
-BlockState = Literal["staged", "published", "withdrawn"]
-SceneState = Literal["uploading", "uploaded", "removed"]
-JobState = Literal["accepted", "running", "successful", "failed", "dismissed"]
-JobResponse = Literal["document", "raw"]
-UploadPurpose = Literal["image", "model", "block"]
 
 # Names that PostgreSQL gives to constraints without a name; a check adds what it checks.
 NAMING_CONVENTION = {

@@ -19,15 +19,11 @@ from sqlalchemy import (
 
 from app.db.schema.base import (
     Double,
-    JobResponse,
-    JobState,
     Json,
     MapOutline,
     Polygon,
     Real,
-    SceneState,
     Timestamp,
-    UploadPurpose,
     clock,
     metadata,
     now,
@@ -35,6 +31,7 @@ from app.db.schema.base import (
     one_of,
     uptime_s,
 )
+from app.db.states import JobResponse, JobState, SceneState, UploadPurpose
 
 scene = Table(
     "scene",

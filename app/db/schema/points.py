@@ -22,7 +22,6 @@ from sqlalchemy import (
 )
 
 from app.db.schema.base import (
-    BlockState,
     Double,
     Json,
     MapOutline,
@@ -35,6 +34,7 @@ from app.db.schema.base import (
     on_map,
     one_of,
 )
+from app.db.states import BlockState
 
 block = Table(
     "block",

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from app.db import installation, revisions, stored_files
 from app.db.cluster import backup as archive
-from app.db.engine import Database, export_snapshot
+from app.db.engine import Database, driver, export_snapshot
 from app.db.stored_files import NamedFile
 from app.errors import Conflict, DamagedFile, InputError, NotFound
 from app.storage import Storage, trash
@@ -47,7 +47,7 @@ def make_backup(here: Installation, folder: Path, progress: Progress = no_progre
         with here.database.snapshot() as connection:
             created_at = datetime.now(UTC).isoformat(timespec="seconds")
             row = installation.read(connection)
-            revision = revisions.current(connection) or ""
+            revision = revisions.current(driver(connection)) or ""
             named = stored_files.read_named_files(connection)
             archive.dump(here.database.dsn, unfinished / ARCHIVE, export_snapshot(connection))
         # From here on the dump is behind the storage, as every older backup.

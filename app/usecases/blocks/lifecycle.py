@@ -13,8 +13,7 @@ from app.db.engine import Connection
 from app.db.ingestion import StoredChipFile, load_contents
 from app.errors import Conflict, InputError
 from app.storage import Storage, StoredFile
-from app.usecases.blocks.listing import find_block as find_block
-from app.usecases.blocks.listing import list_blocks as list_blocks
+from app.usecases.blocks.lookup import find_block as find_block
 from app.usecases.blocks.publication import Published as Published
 from app.usecases.blocks.publication import check_priority
 from app.usecases.blocks.publication import find_published as find_published

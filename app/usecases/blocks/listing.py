@@ -1,63 +1,14 @@
-"""Blocks as the store has them: find one, list them, state their accuracy."""
+"""List the blocks of the store with their accuracy, of the driver's rows alone."""
 
-from collections.abc import Sequence
-
-import numpy as np
-
-from app.db import blocks
-from app.db.blocks import Block
-from app.db.engine import Connection
-from app.db.schema import BlockState
-from app.errors import Conflict, NotFound
+from app.db import block_list
+from app.db.block_list import BlockSummary
+from app.db.revisions import DriverConnection
 from services.quality.accuracy_statement import AccuracyStatement, median_accuracy
 
-_PARTS_OF_DEGREE, _HALF_TURN = 1e6, 180.0
 
-
-def find_block(connection: Connection, reference: str) -> Block:
-    """The block with this number, ID or ID@VERSION.
-
-    Raises:
-        NotFound: there is no such block.
-        Conflict: the ID has several versions.
-    """
-    matches = blocks.find_blocks(connection, reference)
-    if not matches:
-        raise NotFound(
-            f"no block {reference:.100}: expected the number, ID or ID@VERSION of a block of the store"
-        )
-    if len(matches) > 1:
-        versions = ", ".join(f"{block.id}@{block.version}" for block in matches)
-        raise Conflict(f"block {reference} has {len(matches)} versions, name one: {versions}")
-    return matches[0]
-
-
-def block_extent(block: Block) -> tuple[float, float, float, float]:
-    """West, south, east, north of the outline of a block, degrees, rounded outwards to 1e-6.
-
-    West is greater than east across the antimeridian, as in a `bbox` of OGC API.
-    """
-    low, high = block.outline.min(axis=0), block.outline.max(axis=0)
-    west, south = np.floor(low * _PARTS_OF_DEGREE) / _PARTS_OF_DEGREE
-    east, north = np.ceil(high * _PARTS_OF_DEGREE) / _PARTS_OF_DEGREE
-    return _wrapped(west), float(south), _wrapped(east), float(north)
-
-
-def _wrapped(lon_deg: float) -> float:
-    """A longitude from -180 to 180."""
-    return float(lon_deg) if abs(lon_deg) <= _HALF_TURN else float(lon_deg - np.sign(lon_deg) * 360.0)
-
-
-def list_blocks(
-    connection: Connection, states: tuple[BlockState, ...] = ("staged", "published", "withdrawn")
-) -> list[Block]:
-    """The blocks in some states, the newest first."""
-    return blocks.list_blocks(connection, states)
-
-
-def stated_accuracies(connection: Connection, numbers: Sequence[int]) -> dict[int, AccuracyStatement]:
-    """The accuracy of the median points of some blocks, by the numbers of the blocks."""
-    stated = blocks.stated_sigmas(connection, numbers)
-    return {
-        number: median_accuracy(one.horizontal_m, one.up_m, one.frame) for number, one in stated.items()
-    }
+def list_blocks(connection: DriverConnection) -> list[tuple[BlockSummary, AccuracyStatement]]:
+    """All blocks, the newest first, each with the accuracy of its median point."""
+    return [
+        (entry.block, median_accuracy(entry.sigma_horizontal_m, entry.sigma_up_m, entry.frame))
+        for entry in block_list.list_blocks(connection)
+    ]

@@ -7,7 +7,7 @@ from app.db.blocks import Block
 from app.db.engine import Connection
 from app.db.schema import BlockState
 from app.errors import Conflict, InputError, NotFound
-from app.usecases.blocks.listing import find_block
+from app.usecases.blocks.lookup import find_block
 
 MAY_BECOME: dict[BlockState, tuple[BlockState, ...]] = {
     "staged": ("published",),
