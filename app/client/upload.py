@@ -11,8 +11,8 @@ from app.client.job import Progress
 
 TUS = {"Tus-Resumable": "1.0.0"}
 PIECE = "application/offset+octet-stream"
-LOCKED = 423
-"""Status of an upload whose broken connection the service has not noticed yet."""
+BREAKS = (409, 423)
+"""Statuses after a break: bytes of the broken connection arrived since, or are still arriving."""
 MOST_BREAKS = 5
 """Breaks after which an upload is given up when no byte arrived between them."""
 PAUSE_S = 1.0
@@ -51,7 +51,9 @@ def upload_image(connection: Connection, path: Path, sigma_m: float | None, prog
             return str(created.headers["Amers-Scene"])
         except (RequestRefused, ServiceFailure) as error:
             breaks += 1
-            if breaks > MOST_BREAKS or (isinstance(error, RequestRefused) and error.status != LOCKED):
+            if breaks > MOST_BREAKS or (
+                isinstance(error, RequestRefused) and error.status not in BREAKS
+            ):
                 raise
         time.sleep(PAUSE_S)
 

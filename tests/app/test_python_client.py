@@ -11,6 +11,7 @@ import pytest
 from app.client import Client, Job, JobFailed, RequestRefused, ServiceFailure
 from app.client import client as client_module
 from app.client import upload as upload_module
+from app.client.connection import Connection
 from app.config import Settings
 from app.db import engine
 from app.storage import Storage
@@ -155,6 +156,27 @@ def test_an_upload_goes_on_where_its_connection_broke(
         f"{installation.url}/scenes/{scene}/files/{image.name}", headers=authorization, timeout=60.0
     )
     assert sent.content == image.read_bytes()
+
+
+def test_an_upload_goes_on_behind_bytes_that_its_broken_connection_left(
+    service: Client, installation: Installation, monkeypatch: pytest.MonkeyPatch
+):
+    image = installation.world.image
+    left = image.read_bytes()[: image.stat().st_size // 3]
+    request, offsets = Connection.request, []
+
+    def after_others(connection: Connection, method: str, path: str, **options) -> httpx.Response:
+        if method == "PATCH":
+            offsets.append(int(options["headers"]["Upload-Offset"]))
+            if offsets == [0]:
+                headers = {**options["headers"], "Content-Length": str(len(left))}
+                request(connection, method, path, content=left, headers=headers)
+        return request(connection, method, path, **options)
+
+    monkeypatch.setattr(upload_module, "PAUSE_S", 0.2)
+    monkeypatch.setattr(Connection, "request", after_others)
+    service.upload_scene(image)
+    assert offsets == [0, len(left)]
 
 
 def test_an_upload_of_which_no_byte_arrives_is_given_up(
