@@ -32,6 +32,11 @@ RUN = {
     ("docs/guide.md", "from os import environ"): f"{DEMO}::test_the_python_of_the_guide_runs_as_it_is",
     ("docs/guide.md", "from pathlib import Path"): f"{DEMO}::test_the_python_of_the_guide_runs_as_it_is",
     **{
+        block.key: f"{DEMO}::test_the_curl_lines_of_the_guide_register_a_scene_and_read_points"
+        for block in BLOCKS
+        if block.document == "docs/guide.md" and "curl " in block.text
+    },
+    **{
         block.key: GUIDE
         for block in BLOCKS
         if block.document == "docs/guide.md" and block.text.startswith("amers ")
@@ -39,16 +44,9 @@ RUN = {
 }
 """The test that runs a block, by document and first line of the block without its comment."""
 MAKE = "its targets set up a machine; what they start is run by other tests"
-IDS = "has ids that replies give; the tests of the client and of the API send these requests"
 READ = {
     ("README.md", "make demo"): MAKE,
     ("docs/guide.md", "make demo"): MAKE,
-    ("docs/guide.md", 'AUTH="Authorization: Bearer $TOKEN"'): IDS,
-    (
-        "docs/guide.md",
-        'curl -H "$AUTH" -G "$URL/collections/points/items" -d bbox=5.39,43.59,5.41,43.61'
-        " -d f=parquet \\",
-    ): IDS,
 }
 """Why a block is not run, by document and first line of the block without its comment."""
 

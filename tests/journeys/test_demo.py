@@ -10,9 +10,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from uuid import uuid4
 
+import pyarrow.parquet
 import pytest
 
+from services.formats.sensor_models.rpc_files import read_rpc
+from services.formats.sensor_models.rpc_text import format_rpb
 from tests.command_line import Done, amers_here, amers_process
+from tests.documents import blocks_of
 from tests.service_process import Service, until
 
 pytestmark = pytest.mark.long
@@ -159,17 +163,49 @@ def test_the_python_of_the_readme_prints_the_verdict(first_run):
     assert run([sys.executable, "-c", program], service, folder).strip() == "good"
 
 
-@pytest.mark.parametrize("heading", ["One command does the same", "## The library"])
-def test_the_python_of_the_guide_runs_as_it_is(first_run, heading):
+@pytest.fixture(scope="module")
+def reader(first_run) -> tuple[Service, Path]:
+    """The service and the folder, which has the files of the names that the guide gives, and a token."""
     service, folder, _ = first_run
     for name, place in (("scene.tif", "images/scene.tif"), ("my-block", "block")):
-        if not (folder / name).exists():
-            (folder / name).symlink_to(folder / "demo-output" / place)
+        (folder / name).symlink_to(folder / "demo-output" / place)
+    (folder / "scene.RPB").write_text(format_rpb(read_rpc(folder / "scene.tif").model))
     token = ["token", "create", uuid4().hex, "--scope", "register"]
     secret = run([sys.executable, "-m", "app.cli.main", *token], service, folder).strip()
-    program = lines_of(GUIDE, heading, "python").replace("http://127.0.0.1:8000", service.url)
     service.environment["TOKEN"] = secret
+    return service, folder
+
+
+@pytest.mark.parametrize("heading", ["One command does the same", "## The library"])
+def test_the_python_of_the_guide_runs_as_it_is(reader, heading):
+    service, folder = reader
+    program = lines_of(GUIDE, heading, "python").replace("http://127.0.0.1:8000", service.url)
     assert run([sys.executable, "-c", program], service, folder).strip() == "good"
+
+
+def test_the_curl_lines_of_the_guide_register_a_scene_and_read_points(reader):
+    service, folder = reader
+    blocks = "".join(block.text for block in blocks_of("docs/guide.md") if "curl" in block.text)
+    texts = blocks.replace("http://127.0.0.1:8000", service.url).replace("\\\n", " ").splitlines()
+    *settings, upload, model, execute, status, results, report, items, parquet = filter(None, texts)
+    known: dict[str, str] = {}
+
+    def reply(line: str) -> str:
+        for name, value in known.items():
+            line = line.replace(name, value)
+        line = line.replace("curl ", "curl --silent --show-error --fail-with-body ", 1)
+        return run(["bash", "-ec", "\n".join([*settings, line])], service, folder)
+
+    known["SCENE_ID"] = json.loads(reply(upload))["id"]
+    reply(model)
+    known["JOB_ID"] = json.loads(reply(execute))["jobID"]
+    assert until(lambda: json.loads(reply(status))["status"] not in ("accepted", "running"))
+    assert json.loads(reply(results))["verdict"] == "good"
+    reply(report)
+    assert "<html" in (folder / "report.html").read_text(encoding="utf-8")
+    assert len(json.loads(reply(items))["features"]) == 10
+    reply(parquet)
+    assert pyarrow.parquet.read_table(folder / "points.parquet").num_rows > 0
 
 
 @pytest.mark.skipif(shutil.which("ogr2ogr") is None, reason="Debian's gdal-bin is not installed")
