@@ -1,10 +1,22 @@
-"""Check of the arguments of a command: all that is missing or wrong is reported at once."""
+"""Errors about the arguments of a command: all that is wrong at once, by the names of its options."""
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
 import typer
 from typer.core import TyperCommand
+
+from app.errors import AmersError
+
+INPUT = re.compile(r"^[a-z_]+(?=: )|(?<=`)[a-z_]+(?=`)")
+"""The name of an input in an error of the science or of a use case, which know no options."""
+
+
+def by_options(message: str, context: typer.Context) -> str:
+    """A message with the options and arguments of a command in place of the names of inputs."""
+    names = {str(parameter.name): _name(parameter) for parameter in context.command.params}
+    return INPUT.sub(lambda match: names.get(match[0], match[0]), message)
 
 
 class CheckedCommand(TyperCommand):
@@ -24,6 +36,18 @@ class CheckedCommand(TyperCommand):
         problems = list(dict.fromkeys(self._problems(ctx, given))) or [first.format_message()]
         ctx.fail("; ".join(problems))
         raise first
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command.
+
+        Raises:
+            AmersError: as the command raises it, with options in place of the names of inputs.
+        """
+        try:
+            return super().invoke(ctx)
+        except AmersError as error:
+            error.args = (by_options(str(error), ctx), *error.args[1:])
+            raise
 
     def _problems(self, ctx: Any, args: list[str]) -> Iterator[str]:
         """What is missing, then what is wrong with each value."""

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from app.cli.arguments import by_options
 from app.cli.exit_status import SUCCESS
 from app.cli.output import AsJson
 from app.cli.scene_registration import (
@@ -25,6 +26,7 @@ from app.usecases.terrain_file import TerrainFile
 
 
 def register(
+    context: typer.Context,
     scenes: Annotated[
         list[Path], typer.Argument(help="GeoTIFF, JPEG 2000 or NITF, or folders of such images.")
     ],
@@ -138,6 +140,7 @@ def register(
         )
     outcomes = register_scenes(requests, control, Remote(server, token or "") if server else None, jobs)
     for outcome in outcomes:
+        outcome["reason"] = by_options(outcome["reason"], context)
         if outcome["exit_status"] != SUCCESS:
             typer.echo(f"amers: {failure_text(outcome)}", err=True)
     if is_one_scene:

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from app.cli.arguments import by_options
 from app.cli.exit_status import SUCCESS
 from app.cli.joint_registration import JointRequest, register_together
 from app.cli.output import AsJson, print_json, show_one
@@ -15,6 +16,7 @@ from services.sensors.parameter_sets import parameter_set_named
 
 
 def register_many(
+    context: typer.Context,
     scenes: Annotated[
         list[Path], typer.Argument(help="GeoTIFF, JPEG 2000 or NITF, or folders of such images.")
     ],
@@ -77,6 +79,7 @@ def register_many(
     )
     outcomes, joint = register_together(request)
     for outcome in outcomes:
+        outcome["reason"] = by_options(outcome["reason"], context)
         if outcome["exit_status"] != SUCCESS:
             typer.echo(f"amers: {failure_text(outcome)}", err=True)
     if as_json:

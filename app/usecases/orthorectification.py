@@ -140,7 +140,7 @@ class MapLimits:
         if lines * samples > most:
             raise InputError(
                 f"the map would have {lines} x {samples} pixels, at most {most:,} are allowed, "
-                f"{MOST_MAP_PIXELS} times those of the scene: give a larger gsd_m, or a crs for this "
+                f"{MOST_MAP_PIXELS} times those of the scene: give a larger `gsd_m`, or a crs for this "
                 "part of the world"
             )
         # A third more with overviews; compression makes it smaller.
@@ -148,7 +148,7 @@ class MapLimits:
         if self.room_bytes is not None and size_bytes > self.room_bytes:
             raise TooLarge(
                 f"the map may have {size_bytes} bytes, {self.room_bytes} are left of the storage quota: "
-                f"give a larger gsd_m, or {FREE_ROOM}"
+                f"give a larger `gsd_m`, or {FREE_ROOM}"
             )
 
 

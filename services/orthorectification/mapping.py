@@ -127,7 +127,7 @@ def map_into_image(
         if step < 2:
             raise ComputationError(
                 f"the model of the image cannot be interpolated within {tolerance_px:g} px: nodes at "
-                f"every second pixel leave an error of {error_px:.3g} px. Give a larger tolerance_px"
+                f"every second pixel leave an error of {error_px:.3g} px. Give a larger `tolerance_px`"
             )
     line_sample, height_m = _positions(
         table.values, table.ground.heights, step, (window.lines, window.samples), table.heights

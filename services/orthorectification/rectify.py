@@ -118,7 +118,7 @@ def choose_grid(
     if lines * samples > _MAX_MAP_PIXELS:
         raise InputError(
             f"the map would have {lines} x {samples} pixels, at most {_MAX_MAP_PIXELS:,} in all are "
-            "possible: give a larger gsd_m"
+            "possible: give a larger `gsd_m`"
         )
     origin = np.array([first[0] + 0.5, last[1] - 0.5]) * step
     return MapGrid(crs, origin, np.array([[0.0, step[0]], [-step[1], 0.0]]), (lines, samples))

@@ -144,7 +144,7 @@ def plan_geometry(plan: BlockPlan) -> PlanGeometry:
     if not _MIN_POINTS <= len(ground) <= _MAX_POINTS:
         raise InputError(
             f"{len(ground):,} points with a spacing of {plan.spacing_m:g} m, {_MIN_POINTS} to "
-            f"{_MAX_POINTS:,} expected: state another spacing_m"
+            f"{_MAX_POINTS:,} expected: state another `spacing_m`"
         )
     around = [_site_points(site, plan) for site in (*plan.sites, *plan.candidates)]
     lon_lat_h = np.concatenate([ground, *around])
@@ -237,7 +237,7 @@ def _ground(images: Sequence[ImageParameters], plan: BlockPlan) -> Array:
     if counts.prod() > 100.0 * _MAX_POINTS:
         raise InputError(
             f"a spacing of {plan.spacing_m:g} m gives {counts.prod():,.0f} points, at most "
-            f"{_MAX_POINTS:,} expected: state a larger spacing_m"
+            f"{_MAX_POINTS:,} expected: state a larger `spacing_m`"
         )
     axes = [np.arange(low[k] + step[k] / 2.0, high[k], step[k]) for k in range(2)]
     lon_lat = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)

@@ -32,7 +32,7 @@ def visible_points(scene: Scene, points: ControlPoints) -> IntArray:
         raise CoverageError(
             f"none of the {len(points)} control points lies in the scene, "
             f"even with {margin_px:.0f} px of margin for its accuracy of {scene.sigma_m:g} m: state a "
-            "larger sigma_m when the model may be further off"
+            "larger `sigma_m` when the model may be further off"
         )
     return visible
 

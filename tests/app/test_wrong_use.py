@@ -244,7 +244,7 @@ USES: dict[str, WrongUse] = {
     # Tokens.
     "a name that a valid token has": WrongUse(
         ("token", "create", "survey office", "--scope", "read"),
-        "name: the valid token [0-9a-f-]+ is named 'survey office' already: choose another "
+        "NAME: the valid token [0-9a-f-]+ is named 'survey office' already: choose another "
         "name, or revoke .*",
     ),
     "an unknown scope": WrongUse(
@@ -252,7 +252,8 @@ USES: dict[str, WrongUse] = {
         "scopes: write found, one or more of read, .* expected",
     ),
     "a token of no days": WrongUse(
-        ("token", "create", "x", "--scope", "read", "--days", "0"), "days: 0 found, 1 to 36500 expected"
+        ("token", "create", "x", "--scope", "read", "--days", "0"),
+        "--days: 0 found, 1 to 36500 expected",
     ),
     "a token that is not there": WrongUse(
         ("token", "revoke", "nobody"), "no valid token nobody: `amers token list` lists names and ids"
@@ -274,11 +275,11 @@ USES: dict[str, WrongUse] = {
         "block calanques version 1 is already in the store; a changed block .*",
     ),
     "a priority out of range": WrongUse(
-        ("block", "prioritise", "calanques", "5000"), "priority: 5000 found, -1000 to 1000 expected"
+        ("block", "prioritise", "calanques", "5000"), "PRIORITY: 5000 found, -1000 to 1000 expected"
     ),
     "a box without points": WrongUse(
         ("block", "export", "--bbox", "1,1,2,2", "-o", "{new}"),
-        r"bbox: no points are served in \[1.0, 1.0, 2.0, 2.0\]; choose a box on a published block",
+        r"--bbox: no points are served in \[1.0, 1.0, 2.0, 2.0\]; choose a box on a published block",
     ),
     "a point that is not there": WrongUse(
         ("points", "suspend", "7", "--because", "gone"),
@@ -305,9 +306,11 @@ USES: dict[str, WrongUse] = {
     ),
     # Others.
     "an unknown kind of changes": WrongUse(
-        ("audit", "--kind", "weather"), "kind: 'weather' found, one of token, block, .* expected"
+        ("audit", "--kind", "weather"), "--kind: 'weather' found, one of token, block, .* expected"
     ),
-    "too many changes": WrongUse(("audit", "--limit", "5000"), "limit: 5000 found, 1 to 1000 expected"),
+    "too many changes": WrongUse(
+        ("audit", "--limit", "5000"), "--limit: 5000 found, 1 to 1000 expected"
+    ),
     "a batch that is not in the trash": WrongUse(
         ("store", "trash", "restore", "1999"),
         "no batch 1999 in the trash: `amers store trash list` lists them",
@@ -405,6 +408,13 @@ def test_wrong_use_ends_with_one_sentence_and_changes_nothing(place, kind):
     assert done.stdout == ""
     assert PASSWORD not in done.stderr
     assert place.state() == before
+
+
+def test_the_refusal_of_a_scene_names_the_option_that_it_needs(place, tmp_path):
+    done = place.run(WrongUse(("scene", "register", "{map}", "-o", str(tmp_path / "out")), ""))
+    assert "is unknown: give the horizontal accuracy of its map grid as `--sigma-m`, one" in done.stderr
+    assert "`--sigma-m`" in done.stdout
+    assert done.returncode == 2
 
 
 def test_there_are_forty_kinds():

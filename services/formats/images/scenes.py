@@ -246,7 +246,7 @@ def _ortho_sigma_m(path: FilePlace, sensor: str) -> float:
         return sigma_m
     raise FormatError(
         f"{path}: the sensor of this ortho-image is unknown: give the horizontal accuracy of its map "
-        "grid as sigma_m, one standard deviation in metres"
+        "grid as `sigma_m`, one standard deviation in metres"
     )
 
 

@@ -148,7 +148,7 @@ def test_sites_that_no_image_shows_are_not_proposed() -> None:
 def test_what_cannot_be_computed_is_refused() -> None:
     with pytest.raises(InputError, match="1 images"):
         forecast(replace(PLAN, images=strip(1)))
-    with pytest.raises(InputError, match="state another spacing_m"):
+    with pytest.raises(InputError, match="state another `spacing_m`"):
         forecast(replace(PLAN, spacing_m=20_000.0))
     apart = (*strip(2), *(replace(one, name=f"far {one.name}", lon_lat=(7.0, 43.3)) for one in strip(2)))
     with pytest.raises(DisconnectedBlock, match="far image 1, far image 2"):
