@@ -90,6 +90,8 @@ def _slow_because(item: pytest.Item) -> str | None:
         return "journeys"
     if "open_folder" in getattr(item, "fixturenames", ()) or item.get_closest_marker("database"):
         return "tests that need a database"
+    if item.get_closest_marker("endurance"):
+        return "tests of endurance"
     if item.get_closest_marker("monte_carlo"):
         return "Monte Carlo tests"
     return "long tests" if item.get_closest_marker("long") else None
@@ -103,7 +105,7 @@ def _begin_long_ones_first(items: list[pytest.Item]) -> None:
     """
     items.sort(
         key=lambda item: (
-            item.get_closest_marker("long") is None,
+            not any(mark.name == "long" for mark in item.getparent(pytest.Module).own_markers),
             not item.nodeid.startswith("tests/services/"),
         )
     )

@@ -32,6 +32,7 @@ BUDGETS = {
 
 
 @pytest.mark.parametrize("words", BUDGETS)
+@pytest.mark.long
 def test_a_command_imports_no_more_than_its_budget(words):
     beyond = beyond_budget(imported_by(COMMAND, words), BUDGETS[words])
     assert beyond == {}, f"amers {words} imports what it does not need; see who asks for it first"

@@ -31,6 +31,8 @@ from services.production.from_images import ProductionOptions
 from services.simulation.view import SimulatedView, ViewPlan, simulate_block, simulate_view
 from services.simulation.world import World, make_world
 
+pytestmark = pytest.mark.long
+
 CENTRE = (180.0, -17.0)
 SHAPE = (480, 480)
 ERROR_M = (21.0, -13.0)

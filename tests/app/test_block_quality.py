@@ -40,6 +40,8 @@ from tests.app.quality_world import (
 )
 from tests.command_line import amers_here
 
+pytestmark = pytest.mark.long
+
 a_decimetre = 0.1
 a_tenth = 0.1
 MISSED = 3

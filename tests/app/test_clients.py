@@ -261,6 +261,7 @@ def test_the_page_connect_has_the_address_of_the_service(served):
     assert f"{served.url}/connect" in [link["href"] for link in landing["links"]]
 
 
+@pytest.mark.long
 def test_the_page_of_the_documentation_is_that_of_the_service():
     root = Path(__file__).parents[2]
     assert (root / "docs" / "connect.md").read_text() == as_markdown(EXAMPLE)

@@ -78,6 +78,7 @@ def test_a_filter_that_ends_its_parser_is_refused_and_the_next_one_answered() ->
     assert cql2_process.parse("text", "a = 1") == {"op": "=", "args": [{"property": "a"}, 1.0]}
 
 
+@pytest.mark.long
 def test_a_filter_that_never_ends_is_refused_while_others_are_answered() -> None:
     refusals: list[str] = []
 

@@ -14,6 +14,7 @@ LONGEST_S = 5.0
 """Time for one filter on a busy machine; its parser has 2 s of CPU at most."""
 
 
+@pytest.mark.long
 def test_random_filters_are_accepted_or_refused_and_nothing_else(request: pytest.FixtureRequest):
     count = COUNTS[request.config.getoption("--attacks")]
     run = subprocess.run(

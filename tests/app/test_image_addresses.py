@@ -85,6 +85,7 @@ def read_bytes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return lengths
 
 
+@pytest.mark.long
 def test_an_image_in_a_bucket_is_read_by_parts_and_pixel_for_pixel(bucket, image, read_bytes) -> None:
     at = open_raster(bucket.put("a folder/noise é.tif", image))
     here = open_raster(image)
@@ -100,6 +101,7 @@ def test_an_image_in_a_bucket_is_read_by_parts_and_pixel_for_pixel(bucket, image
         opened.close()
 
 
+@pytest.mark.long
 def test_the_parts_in_memory_are_bounded(bucket, image, monkeypatch) -> None:
     monkeypatch.setattr(addresses, "KEPT_BLOCKS", 5)
     kept = addresses._KeptBlocks()
@@ -152,6 +154,7 @@ def test_what_is_no_image_in_a_bucket_is_refused_like_a_file(bucket) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.tif", "a.jp2", "a.ntf"])
+@pytest.mark.long
 def test_an_image_that_vanishes_gives_an_error_and_no_pixels(bucket, image, tmp_path, name) -> None:
     driver = {"a.tif": "GTiff", "a.jp2": "JP2OpenJPEG", "a.ntf": "NITF"}[name]
     exact = {"QUALITY": "100", "REVERSIBLE": "YES"} if name == "a.jp2" else {}
@@ -166,6 +169,7 @@ def test_an_image_that_vanishes_gives_an_error_and_no_pixels(bucket, image, tmp_
     at.close()
 
 
+@pytest.mark.long
 def test_a_process_ends_well_with_an_image_open(bucket, image) -> None:
     address = bucket.put("noise.tif", image)
     code = f"""

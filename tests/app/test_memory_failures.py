@@ -82,6 +82,7 @@ def test_other_errors_are_no_lack_of_memory_of_this_process(error: BaseException
     assert not is_no_memory(error)
 
 
+@pytest.mark.long
 def test_a_tile_that_memory_does_not_hold_is_no_damaged_file(tmp_path: Path):
     """GDAL raises its error for memory below two others, which the reader takes for a damaged file."""
     path = tmp_path / "one_tile.tif"

@@ -75,6 +75,7 @@ def delivered_scene(gsd_m: float, seed: int) -> tuple[Scene, OrthoModel]:
 @pytest.mark.parametrize(
     ("base", "scene_m", "origin"), [("gcplib", 15.0, "centre-1"), ("copernicus", 10.0, "")]
 )
+@pytest.mark.long
 def test_a_scene_registers_on_the_chips_of_a_base_as_accurately_as_declared(
     base: str,
     scene_m: float,
@@ -112,6 +113,7 @@ def test_a_scene_registers_on_the_chips_of_a_base_as_accurately_as_declared(
     print(*lines, sep="\n")
 
 
+@pytest.mark.long
 def test_chips_and_views_of_a_block_are_those_of_the_base(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

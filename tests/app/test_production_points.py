@@ -169,6 +169,7 @@ def test_an_existing_block_is_not_overwritten(amers, image: Path, tmp_path: Path
     assert "already exists; a block is written into a new folder" in " ".join(said.stderr.split())
 
 
+@pytest.mark.long
 def test_two_ortho_images_make_one_block_on_the_command_line(amers, image: Path, tmp_path: Path) -> None:
     again = written_image(tmp_path / "again.tif")
     heights = ("--height-m", "90", "--height-sigma-m", "5", "--sigma-m", "2", "--points", "25")

@@ -75,6 +75,7 @@ def killed_at(number: int, work: Callable[[], None]) -> bool:
 
 @pytest.mark.endurance
 @pytest.mark.parametrize("exchanges", [True, False])
+@pytest.mark.long
 def test_a_result_is_whole_wherever_its_writer_is_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exchanges: bool
 ):
@@ -103,6 +104,7 @@ def test_a_result_is_whole_wherever_its_writer_is_killed(
     assert number > 2 * len(FILES)
 
 
+@pytest.mark.long
 def test_a_first_result_is_whole_or_absent_wherever_its_writer_is_killed(tmp_path: Path):
     folder = tmp_path / "deep" / "out"
     was_killed, number = True, 0

@@ -47,6 +47,7 @@ def run(*arguments: str | Path) -> int:
     return int(ended.value.code or 0)
 
 
+@pytest.mark.long
 def test_a_scene_is_registered_on_a_reference_without_any_database(
     images: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -65,6 +66,7 @@ def test_a_scene_is_registered_on_a_reference_without_any_database(
     }
 
 
+@pytest.mark.long
 def test_the_stated_frame_of_a_reference_gives_an_accuracy_on_the_earth(
     images: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

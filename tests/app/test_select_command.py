@@ -65,6 +65,7 @@ def area(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_a_selection_is_written_with_cells_tables_and_report(select, catalogue, area, tmp_path):
     out = tmp_path / "out"
     said = select(catalogue, "-o", out, "--area", area, "--json")
@@ -92,6 +93,7 @@ def test_a_selection_is_written_with_cells_tables_and_report(select, catalogue, 
     assert short == pytest.approx((missing > 0).mean(), abs=0.01)
 
 
+@pytest.mark.long
 def test_the_written_selection_is_a_catalogue_again(select, catalogue, area, tmp_path):
     """With its masks: hardly an image of a selection is unnecessary, and no more ground is short."""
     select(catalogue, "-o", tmp_path / "one", "--area", area)
@@ -107,6 +109,7 @@ def test_the_written_selection_is_a_catalogue_again(select, catalogue, area, tmp
     assert shares[1] == pytest.approx(shares[0], abs=0.01)
 
 
+@pytest.mark.long
 def test_the_terminal_gets_tables_and_the_verdict(select, catalogue, area, tmp_path):
     said = select(catalogue, "-o", tmp_path / "out", "--area", area)
     assert said.status == 0
@@ -116,6 +119,7 @@ def test_the_terminal_gets_tables_and_the_verdict(select, catalogue, area, tmp_p
     assert "nan" not in said.stdout
 
 
+@pytest.mark.long
 def test_the_page_needs_no_network_and_shows_both_maps(select, catalogue, area, tmp_path):
     select(catalogue, "-o", tmp_path / "out", "--area", area)
     page = (tmp_path / "out" / "report.html").read_text()
@@ -133,6 +137,7 @@ def test_the_page_needs_no_network_and_shows_both_maps(select, catalogue, area, 
     assert "http://" not in page.replace("http://www.w3.org", "")
 
 
+@pytest.mark.long
 def test_options_change_what_is_asked(select, catalogue, area, tmp_path):
     words = ("--area", area, "--min-views", 2, "--cloud-limits", "10,30", "--since", "2024-01-01")
     said = select(catalogue, "-o", tmp_path / "out", *words, "--cell-km", 20, "--max-snow", 0, "--json")
@@ -154,6 +159,7 @@ def test_options_change_what_is_asked(select, catalogue, area, tmp_path):
         (("--since", "2100-01-01"), "before the first time asked for, 2 cannot be used"),
     ],
 )
+@pytest.mark.long
 def test_what_cannot_be_done_is_refused_and_nothing_written(select, catalogue, tmp_path, words, message):
     said = select(catalogue, "-o", tmp_path / "out", *words)
     assert said.status == 2
@@ -161,6 +167,7 @@ def test_what_cannot_be_done_is_refused_and_nothing_written(select, catalogue, t
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.long
 def test_an_older_selection_is_replaced_as_a_whole_and_kept_when_the_new_one_fails(
     select, catalogue, area, tmp_path
 ):

@@ -6,6 +6,8 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
 PATIENCE_S = 60.0
 SUPERVISOR = """
 import logging, sys
@@ -102,6 +104,7 @@ def test_a_process_that_does_not_listen_is_killed_after_its_time(tmp_path):
     assert supervisor.wait(PATIENCE_S) == 128 + signal.SIGTERM
 
 
+@pytest.mark.long
 def test_the_supervisor_imports_neither_the_server_nor_the_science():
     program = (
         "import sys, app.cli.serve;"

@@ -103,6 +103,7 @@ def test_the_order_is_that_of_the_truth_and_its_covariance_is_honest(order: Orde
     assert 0.7 < np.mean([normalised_square(f, TRUTH[order]) for f in right]) < 1.25
 
 
+@pytest.mark.long
 def test_a_skew_of_two_pixels_asks_for_an_affine() -> None:
     rng = np.random.default_rng(3)
     skewed = np.array([[5.0, 0.0, 2.0], [5.0, -2.0, 0.0]])
@@ -136,6 +137,7 @@ def test_few_points_do_not_carry_an_affine() -> None:
 
 
 @pytest.mark.parametrize("order", ["shift", "drift", "affine"])
+@pytest.mark.long
 def test_three_points_in_ten_may_be_wrong(order: Order) -> None:
     rng = np.random.default_rng(4)
     squares, kept_wrong, lost_right = [], 0, 0
@@ -149,6 +151,7 @@ def test_three_points_in_ten_may_be_wrong(order: Order) -> None:
     assert lost_right < 0.02 * 28 * TRIALS / 4
 
 
+@pytest.mark.long
 def test_two_points_in_ten_may_be_wrong_when_the_order_is_chosen_too() -> None:
     rng = np.random.default_rng(5)
     result = [with_blunders(seen(TRUTH["affine"], rng), 8, rng).adjust() for _ in range(TRIALS // 4)]
@@ -375,17 +378,20 @@ def test_what_parts_of_the_image_are_off_by_is_in_the_accuracy_of_every_place(
     assert least < np.mean([square for _, square in results]) < 1.5
 
 
+@pytest.mark.long
 def test_points_that_may_err_explain_what_neighbours_share() -> None:
     local_px = [result.local_sigma_px for result, _ in displaced(patches, 2.0)]
     assert np.max(local_px) < 0.1
 
 
+@pytest.mark.long
 def test_independent_errors_are_no_errors_of_parts_of_the_image() -> None:
     rng = np.random.default_rng(17)
     local_px = [seen(TRUTH["affine"], rng, n=120).adjust().local_sigma_px for _ in range(TRIALS // 10)]
     assert np.median(local_px) < 0.2 * NOISE_PX
 
 
+@pytest.mark.long
 def test_a_third_of_blunders_does_not_hide_the_order():
     rng = np.random.default_rng(9)
     orders = [

@@ -72,6 +72,7 @@ def without(observations: ControlObservations, hidden: Array) -> ControlObservat
 
 
 @pytest.mark.parametrize("lost", [3.0, 40.0, 150.0, -3.0, -60.0])
+@pytest.mark.long
 def test_both_parts_are_right_and_so_is_what_is_stated(lost: float) -> None:
     normalised, largest = [], []
     for seed in range(12):

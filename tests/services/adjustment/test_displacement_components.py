@@ -231,6 +231,7 @@ def test_residuals_that_grow_with_height_are_named_so() -> None:
     assert all(one.chance("height") < MAX_CHANCE for one in trials)
 
 
+@pytest.mark.long
 def test_heights_with_errors_on_level_ground_are_not_taken_for_another_view() -> None:
     """A point that is too high by its error is displaced by it, in every model."""
     rng = np.random.default_rng(3)

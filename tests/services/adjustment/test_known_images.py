@@ -130,6 +130,7 @@ def test_the_frame_of_a_neighbour_carries_over_and_covers_the_truth(layout) -> N
 
 
 @pytest.mark.parametrize("layout", ["star", "strip"])
+@pytest.mark.long
 def test_both_blocks_agree_along_the_seam_as_they_declare(layout) -> None:
     """What the second block changes of the common images is what it knows more of them."""
     changes, steps, free_steps = [], [], []

@@ -97,6 +97,7 @@ def test_a_refit_leaves_out_the_same_ground():
     assert beside(again, truth, THIRD)[0] < WRONG
 
 
+@pytest.mark.long
 def test_the_larger_area_is_the_scene_even_where_the_smaller_has_more_points():
     rng = np.random.default_rng(8)
     observations, truth = draw(THIRD, rng, count=200, wrong=0.0)
@@ -127,6 +128,7 @@ def test_ground_that_holds_nearly_all_usable_points_stays_the_scene():
     assert adjustment.active[on_it].mean() > 0.9
 
 
+@pytest.mark.long
 def test_chips_that_are_the_same_can_be_compared():
     observations, truth = draw(THIRD, np.random.default_rng(3), wrong=0.0)
     twice = replace(

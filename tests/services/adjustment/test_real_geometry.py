@@ -109,6 +109,7 @@ def base(truth: Array, seen: Array, rng: np.random.Generator) -> ControlGround:
 
 
 @pytest.mark.parametrize("control", [False, True])
+@pytest.mark.long
 def test_points_are_as_precise_as_predicted_in_their_frame(drawn, control: bool) -> None:
     errors, covariances = [], []
     for block in drawn(control):
@@ -128,6 +129,7 @@ def test_points_are_as_precise_as_predicted_in_their_frame(drawn, control: bool)
 
 
 @pytest.mark.parametrize("control", [False, True])
+@pytest.mark.long
 def test_errors_on_the_earth_are_those_declared(drawn, control: bool) -> None:
     frame = []
     for block in drawn(control):

@@ -69,6 +69,7 @@ def median_px(block: BlockAdjustment, observations: Observations) -> float:
 
 
 @pytest.mark.parametrize(("folder", "largest_px"), [("miami_university", 0.18), ("richards_bay", 0.15)])
+@pytest.mark.long
 def test_rays_of_real_tie_points_meet(real_data: Path, folder: str, largest_px: float) -> None:
     block, observations = adjusted(real_data / "skysat_tiepoints" / folder)
     found_px = median_px(block, observations)

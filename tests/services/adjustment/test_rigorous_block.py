@@ -127,6 +127,7 @@ def test_a_tenth_of_wrong_observations_leaves_the_regions_as_good() -> None:
     assert with_blunders > without - 0.05
 
 
+@pytest.mark.long
 def test_parameters_are_recovered_within_their_sigmas() -> None:
     images = rigorous(TOUTIN)[:2]
     square = []

@@ -1,6 +1,7 @@
 """The blocks of the inverse of a sparse matrix are those of its dense inverse."""
 
 import numpy as np
+import pytest
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
@@ -10,6 +11,7 @@ from services.adjustment.selected_inverse import selected_inverse
 IMAGES, SIZE = 60, 3
 
 
+@pytest.mark.long
 def test_blocks_of_pairs_are_those_of_the_dense_inverse() -> None:
     rng = np.random.default_rng(1)
     # Points are seen by images near each other, in rows of ten.

@@ -131,6 +131,7 @@ def test_few_or_unknown_strips_show_nothing() -> None:
         assert not short_motion(some, where, SIDE_PX).variance_px2.any()
 
 
+@pytest.mark.long
 def test_the_memory_does_not_grow_with_the_scene() -> None:
     """A scene of 60,000 lines has thousands of periods and points."""
     rng = np.random.default_rng(5)
@@ -182,6 +183,7 @@ def test_the_stated_accuracy_holds_motion_that_positions_of_chips_cannot_show(
     assert all(one.chance < MAX_CHANCE for one in named)
 
 
+@pytest.mark.long
 def test_motion_that_is_followed_is_not_counted_again() -> None:
     """A swing longer than chips moves their strips as well, until the correction follows it."""
     results = [adjusted(swing(1200.0, (3.0, 3.0)), seed, 0.3) for seed in range(5)]

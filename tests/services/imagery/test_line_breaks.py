@@ -47,6 +47,7 @@ def test_lost_and_repeated_lines_are_seen_at_their_line(lost: int) -> None:
         assert found(broken(ground(seed), line, lost)) == [line]
 
 
+@pytest.mark.long
 def test_an_image_that_is_whole_has_no_breaks() -> None:
     assert not any(found(ground(seed)) for seed in range(20))
 
@@ -69,6 +70,7 @@ def test_bad_lines_are_no_breaks() -> None:
     assert not found(pixels)
 
 
+@pytest.mark.long
 def test_a_sensor_that_changes_its_gain_or_its_offset_breaks_nothing() -> None:
     across = np.linspace(-300.0, 300.0, SAMPLES, dtype=np.float32)
     for seed in range(4):
@@ -128,6 +130,7 @@ class Watched(ArrayImage):
         return super().read(window)
 
 
+@pytest.mark.long
 def test_of_a_wide_image_strips_are_read_piece_by_piece() -> None:
     lines = 2500
     image = Watched(broken(ground(7, (lines + 30, 6000)), 1800, 30))

@@ -104,6 +104,7 @@ def test_errors_are_those_stated_relative_and_on_the_earth() -> None:
     assert 0.5 < earth < 1.7
 
 
+@pytest.mark.long
 def test_a_scene_with_few_points_is_held_by_the_ties_of_its_neighbours() -> None:
     alone, together = [], []
     for trial in range(4):
@@ -121,6 +122,7 @@ def test_a_scene_with_few_points_is_held_by_the_ties_of_its_neighbours() -> None
     assert rms[1] < 0.6 * rms[0]
 
 
+@pytest.mark.long
 def test_a_single_scene_is_adjusted_as_it_is_alone() -> None:
     for trial in range(6):
         rng = np.random.default_rng([3, trial])
@@ -161,6 +163,7 @@ def test_a_scene_that_swings_is_followed_with_the_stated_accuracy(swing_px: tupl
 
 
 @pytest.mark.parametrize("bend_px", [(8.0, 0.0), (6.0, 6.0)])
+@pytest.mark.long
 def test_a_bent_scene_is_named_and_does_not_spoil_the_others(bend_px: tuple[float, float]) -> None:
     rng = np.random.default_rng(4)
     truth = truth_of(rng, bend_px=bend_px)
@@ -240,6 +243,7 @@ def test_a_scene_that_joins_agrees_with_one_adjustment_of_all_scenes() -> None:
     assert 0.1 < np.mean(accurate) < 2.5
 
 
+@pytest.mark.long
 def test_a_scene_that_joins_a_swinging_one_is_tied_to_what_that_scene_truly_shows() -> None:
     squares = []
     for trial in range(3):
@@ -309,6 +313,7 @@ def test_blocks_that_lie_apart_both_keep_their_points() -> None:
 
 
 @pytest.mark.parametrize("shows_points", [True, False])
+@pytest.mark.long
 def test_a_scene_without_control_points_is_stated_with_those_of_its_neighbours(
     shows_points: bool,
 ) -> None:

@@ -116,6 +116,7 @@ def block_of(folder: Path, seed: int, *, control: int = 60) -> tuple[JointTruth,
     return truth, block
 
 
+@pytest.mark.long
 def test_an_adjusted_orbit_agrees_with_the_rpc_of_the_vendor(real_data: Path) -> None:
     """What the metadata differ from it by, 0.04 to 0.4 px, no parameter of a satellite follows."""
     largest_px, squares = [], []

@@ -214,6 +214,7 @@ def test_a_scene_with_other_free_parameters_cannot_join() -> None:
         )
 
 
+@pytest.mark.long
 def test_the_nearest_correction_states_what_it_misses() -> None:
     """At other places than those of the fit, positions and their variances are those of the model."""
     rng = np.random.default_rng(34)
@@ -236,6 +237,7 @@ def test_the_nearest_correction_states_what_it_misses() -> None:
     np.testing.assert_allclose(ratio, 1.0, rtol=0.05)
 
 
+@pytest.mark.long
 def test_every_scene_of_a_mixed_block_is_qualified_and_has_an_rpc() -> None:
     rng = np.random.default_rng(35)
     truth = mixed(rng)
@@ -257,6 +259,7 @@ def test_every_scene_of_a_mixed_block_is_qualified_and_has_an_rpc() -> None:
     assert refined.max_error_px < 0.01
 
 
+@pytest.mark.long
 def test_a_bent_rigorous_scene_is_named_and_does_not_spoil_the_others() -> None:
     rng = np.random.default_rng(36)
     truth = mixed(rng)

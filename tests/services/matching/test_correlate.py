@@ -89,6 +89,7 @@ def test_white_noise_moves_a_chip_by_less_than_a_twentieth_of_a_pixel(smoothness
 
 @pytest.mark.parametrize("noise", [0.2, 0.45])
 @pytest.mark.parametrize("smoothness_px", [1.0, 1.5, 2.5])
+@pytest.mark.long
 def test_measures_have_no_bias(smoothness_px: float, noise: float) -> None:
     for noise_smoothness in (None, smoothness_px):
         outcome = trials(smoothness_px, noise, noise_smoothness, 3)
@@ -99,6 +100,7 @@ def test_measures_have_no_bias(smoothness_px: float, noise: float) -> None:
 @pytest.mark.parametrize("noise", [0.2, 0.45])
 @pytest.mark.parametrize("noise_smoothness_px", [None, 1.0, 2.5])
 @pytest.mark.parametrize("smoothness_px", [1.0, 2.5])
+@pytest.mark.long
 def test_the_stated_sigma_is_honest_for_any_smoothness_of_the_noise(
     smoothness_px: float, noise_smoothness_px: float | None, noise: float
 ) -> None:
@@ -109,6 +111,7 @@ def test_the_stated_sigma_is_honest_for_any_smoothness_of_the_noise(
 
 @pytest.mark.parametrize("smoothness_px", [1.0, 2.5, 4.0])
 @pytest.mark.parametrize("side", [41, SIDE])
+@pytest.mark.long
 def test_the_stated_sigma_is_honest_where_noise_is_smooth_over_several_squares(
     side: int, smoothness_px: float
 ) -> None:
@@ -124,6 +127,7 @@ def test_the_stated_sigma_is_not_too_small_under_haze(smoothness_px: float) -> N
     assert 0.4 < trials(smoothness_px, 0.45, 5.0, 4).normalised_square < 1.5
 
 
+@pytest.mark.long
 def test_the_stated_sigma_grows_with_the_noise_and_with_the_smoothness() -> None:
     def sigma(smoothness_px: float, noise: float) -> float:
         return float(np.median(trials(smoothness_px, noise, smoothness_px, 6).sigma_px))

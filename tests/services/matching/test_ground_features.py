@@ -75,6 +75,7 @@ def matched_errors_px(one: Scene, other: Scene, truth: tuple, gsd_m: float) -> n
     return np.asarray(offset[:, 0] * along[:, 1] - offset[:, 1] * along[:, 0])
 
 
+@pytest.mark.long
 def test_a_turned_image_has_the_same_features() -> None:
     scene = block_views()[0].as_scene(BLOCK_SIGMA_M)
     gsd_m = scene_gsd_m(scene)
@@ -89,6 +90,7 @@ def test_a_turned_image_has_the_same_features() -> None:
     assert np.median(alike[same]) > 0.99
 
 
+@pytest.mark.long
 def test_views_of_other_orbits_and_pixel_sizes_share_details() -> None:
     one, other = block_views()[0], coarse_view()
     truth = one.geometry.true_model, other.geometry.true_model
@@ -99,6 +101,7 @@ def test_views_of_other_orbits_and_pixel_sizes_share_details() -> None:
     assert np.mean(np.abs(error_px) < a_pixel) > 0.9
 
 
+@pytest.mark.long
 def test_memory_is_that_of_a_part_and_parts_leave_no_gap() -> None:
     """Parts of a third of the image find as many features everywhere as one part that holds it all."""
     scene = block_views()[0].as_scene(BLOCK_SIGMA_M)
@@ -138,6 +141,7 @@ def test_an_image_without_pixels_has_no_features() -> None:
 
 
 @pytest.mark.parametrize("lost", [np.nan, np.inf])
+@pytest.mark.long
 def test_no_feature_lies_within_four_pixels_of_an_area_without_data(lost: float) -> None:
     """The edge of such an area is a strong detail that no other image shows."""
     view = block_views()[0].as_scene(BLOCK_SIGMA_M)

@@ -109,6 +109,7 @@ def test_the_stated_sigma_is_honest_whatever_is_missing(
 
 
 @pytest.mark.parametrize("kind", ["scattered", "patches"])
+@pytest.mark.long
 def test_the_stated_sigma_is_honest_with_gaps_on_both_sides(kind: Kind) -> None:
     outcome = trials(kind, "both", 0.15, 1.5, white=True)
     assert outcome.lost == 0
@@ -117,6 +118,7 @@ def test_the_stated_sigma_is_honest_with_gaps_on_both_sides(kind: Kind) -> None:
 
 @pytest.mark.parametrize("where", ["patch", "chip", "both"])
 @pytest.mark.parametrize("kind", ["scattered", "patches"])
+@pytest.mark.long
 def test_less_than_one_percent_missing_costs_nothing(kind: Kind, where: Where) -> None:
     whole, damaged = (trials(kind, where, share, 1.5, white=True) for share in (0.0, 0.009))
     assert damaged.lost == 0
@@ -124,6 +126,7 @@ def test_less_than_one_percent_missing_costs_nothing(kind: Kind, where: Where) -
     np.testing.assert_allclose(np.median(damaged.sigma_px), np.median(whole.sigma_px), rtol=0.05)
 
 
+@pytest.mark.long
 def test_the_stated_sigma_grows_with_what_is_missing() -> None:
     sigma = [
         float(np.median(trials("patches", "patch", share, 1.5, white=True).sigma_px))

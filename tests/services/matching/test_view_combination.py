@@ -54,6 +54,7 @@ def normalised_squares(points: list[ViewCombination]) -> Array:
 
 @pytest.mark.parametrize("tau_px", [0.0, 0.05, 0.15])
 @pytest.mark.parametrize("views", [1, 2, 3, 4, 6])
+@pytest.mark.long
 def test_ninety_percent_of_the_points_lie_in_their_region(views: int, tau_px: float) -> None:
     # Points of other numbers of views belong to the same search, as they do in a scene.
     counts = np.concatenate([np.full(400, views), np.tile([2, 3, 4], 60)])

@@ -85,6 +85,7 @@ def expected(ground: Terrain, grid: MapGrid) -> np.ndarray:
 
 @pytest.mark.parametrize("kernel", ["bilinear", "cubic"])
 @pytest.mark.parametrize("crs", [None, "EPSG:4326", "EPSG:2154"])
+@pytest.mark.long
 def test_every_map_pixel_shows_the_position_that_the_model_projects(
     kernel: str, crs: str | None
 ) -> None:
@@ -270,6 +271,7 @@ def test_voids_of_image_and_terrain_are_nodata() -> None:
     assert 1800 < lost.sum() < 4500
 
 
+@pytest.mark.long
 def test_occluded_ground_is_ground_that_no_line_of_sight_meets_first() -> None:
     ground = terrain(300.0)
     grid = choose_grid(scene(), ground)

@@ -76,6 +76,7 @@ def with_wrong_heights() -> KnownPoints:
     return produce_known_points(file, [view().as_scene(IMAGE_SIGMA_M)], KNOWN_FRAME, options)
 
 
+@pytest.mark.long
 def test_the_error_of_a_height_acts_along_the_line_of_sight() -> None:
     found = with_wrong_heights()
     assert len(found.points) > 40
@@ -138,6 +139,7 @@ def test_every_point_that_is_left_out_is_counted_by_its_reason() -> None:
     assert found.source_id.tolist() == [f"P{number}" for number in range(len(good))]
 
 
+@pytest.mark.long
 def test_a_displaced_scene_is_registered_on_the_points() -> None:
     found = produce_known_points(ground(places(8)), [ortho(land())], KNOWN_FRAME)
     scene = replace(ortho(moved(land(), *MOVED_PX)), sigma_m=30.0)
@@ -148,6 +150,7 @@ def test_a_displaced_scene_is_registered_on_the_points() -> None:
     np.testing.assert_allclose(shift_px, MOVED_PX, atol=0.01)
 
 
+@pytest.mark.long
 def test_several_images_give_views_and_the_error_of_the_points() -> None:
     scenes = [date(0), date(1)]
     found = produce_known_points(ground(places(9), (0.01, 0.01, 1.0)), scenes, UNKNOWN_FRAME)
@@ -191,6 +194,7 @@ def test_too_few_points_are_refused_with_the_counts() -> None:
         produce_known_points(ground(far), [ortho(land())], UNKNOWN_FRAME)
 
 
+@pytest.mark.long
 def test_points_stay_where_the_file_has_them_whatever_the_order_of_the_images() -> None:
     file = ground(places(6))
     for scenes in ([date(0, 0.0), date(1, 0.0)], [date(1, 0.0), date(0, 0.0)]):

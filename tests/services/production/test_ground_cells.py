@@ -32,6 +32,7 @@ def test_the_cells_cover_the_earth_and_are_nearly_equal():
 
 
 @pytest.mark.parametrize("seed", range(6))
+@pytest.mark.long
 def test_the_cells_of_a_footprint_are_those_whose_centre_it_contains(seed):
     rng = np.random.default_rng(seed)
     grid = ground_grid(20_000.0)

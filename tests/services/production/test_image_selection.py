@@ -67,6 +67,7 @@ def clear_views(catalogue, rows, places):
     return views
 
 
+@pytest.mark.long
 def test_every_place_has_the_views_that_the_catalogue_allows(catalogue, selection):
     """Every cell, counted again from footprints and masks, with the cloud limit of the cell."""
     cells, options = selection.cells, selection.options
@@ -86,6 +87,7 @@ def test_every_place_has_the_views_that_the_catalogue_allows(catalogue, selectio
     assert len(np.unique(cells.step)) > 2
 
 
+@pytest.mark.long
 def test_cells_stay_short_exactly_where_all_usable_images_are_too_few(catalogue, selection):
     places = selection.cells.grid.centres(selection.cells.cell)
     usable = np.flatnonzero(image_steps(with_cloud_from_masks(catalogue), selection.options) >= 0)

@@ -51,6 +51,7 @@ def solve(problem):
 
 
 @pytest.mark.parametrize("seed", range(12))
+@pytest.mark.long
 def test_a_cover_is_near_the_optimum_and_the_bound_below_it(seed):
     matrix, problem = random_problem(seed)
     cover, bound = solve(problem)

@@ -26,6 +26,7 @@ def test_the_90_percent_quantile_is_bounded_above_from_29_values_on(n, bounded):
     assert ("do not bound" in quantile.note) == (not bounded)
 
 
+@pytest.mark.long
 def test_the_interval_holds_the_true_quantile_as_often_as_stated():
     rng = np.random.default_rng(5)
     trials, n, truth = 2000, 60, -np.log(0.1)
@@ -37,6 +38,7 @@ def test_the_interval_holds_the_true_quantile_as_often_as_stated():
     assert inside / trials > 0.9 - three_standard_errors
 
 
+@pytest.mark.long
 def test_the_estimate_is_above_the_truth_as_often_as_below():
     rng = np.random.default_rng(6)
     trials, truth = 4000, -np.log(0.1)

@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose
 
 from services.geodesy import move_metres
@@ -85,6 +86,7 @@ def site(
 WEST, EAST = ((0, 0), (SIDE, 1100)), ((0, 1300), (SIDE, 1100))
 
 
+@pytest.mark.long
 def test_the_errors_of_the_points_are_found_at_a_site() -> None:
     points, chips = block()
     rng = np.random.default_rng(5)
@@ -110,6 +112,7 @@ def test_the_errors_of_the_points_are_found_at_a_site() -> None:
     assert_allclose(quality.normalised_frame.mean_square, expected, rtol=0.2)
 
 
+@pytest.mark.long
 def test_points_that_declare_too_little_are_told_so() -> None:
     points, chips = block()
     error_m = np.random.default_rng(6).normal(0.0, POINT_SIGMA_M, (len(points), 2))
@@ -120,6 +123,7 @@ def test_points_that_declare_too_little_are_told_so() -> None:
     assert quality.typical_ratio > 2.0
 
 
+@pytest.mark.long
 def test_check_only_sites_are_told_apart_from_control_sites() -> None:
     points, chips = block()
     sites = [
@@ -160,6 +164,7 @@ def test_the_ortho_images_of_several_sites_err_less_together_than_one() -> None:
         assert_allclose(quality.normalised_frame.mean_square, expected, rtol=1e-9)
 
 
+@pytest.mark.long
 def test_what_an_ortho_image_states_of_its_details_is_in_the_errors_found_on_it() -> None:
     points, chips = block()
     sharp = site("corner", (0, 0), (700, 700))
@@ -170,6 +175,7 @@ def test_what_an_ortho_image_states_of_its_details_is_in_the_errors_found_on_it(
     assert_allclose(second.covariance_m2, first.covariance_m2 + added_m2, atol=1e-9)
 
 
+@pytest.mark.long
 def test_a_shift_beyond_the_near_search_is_found_when_the_frame_lets_expect_it() -> None:
     points, chips = block()
     far = Frame.from_sigmas(40.0, 40.0)
@@ -181,6 +187,7 @@ def test_a_shift_beyond_the_near_search_is_found_when_the_frame_lets_expect_it()
     assert_allclose(np.median(errors.error_m, axis=0), [70.0, -55.0], atol=a_tenth_of_a_metre)
 
 
+@pytest.mark.long
 def test_other_ground_gives_no_error_but_the_reasons() -> None:
     points, chips = block()
     here = site("west", *WEST)

@@ -132,6 +132,7 @@ def test_a_bug_in_the_adjustment_is_not_taken_for_an_instability(registered):
         qualified(registered(), refit=refit)
 
 
+@pytest.mark.long
 def test_the_predicted_accuracy_is_honest_about_the_true_correction(registered):
     """The true error at a corner stays within the predicted CE90 nine times in ten."""
     inside = []
@@ -226,6 +227,7 @@ def test_what_points_of_three_metres_are_known_to_give_is_good(registered):
 @pytest.mark.parametrize("stated_px", [0.2, 1.0, 2.0, 3.0, 6.0, 20.0])
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("error", [{"bend_px": 2.6}, {"points_px": 2.6}])
+@pytest.mark.long
 def test_points_that_state_large_sigmas_hide_no_error(registered, error, seed, stated_px):
     """20 points with errors of 2.6 px, of the model or of their own, never make a good registration."""
     scene = registered(n=20, lost=0, wrong=0, seed=seed, stated_px=stated_px, **error)

@@ -11,6 +11,8 @@ from services.geodesy import move_metres
 from services.quality.site_reach import SiteReach, site_reach
 from services.types import Frame
 
+pytestmark = pytest.mark.long
+
 OFF_M = 1.0
 
 

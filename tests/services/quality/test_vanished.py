@@ -59,6 +59,7 @@ def test_a_point_that_no_scene_has_ever_found_is_one_of_them(rng: np.random.Gene
     assert np.isnat(vanished.last_found[vanished.point == 3]).all()
 
 
+@pytest.mark.long
 def test_at_most_one_in_twenty_is_still_there(rng: np.random.Generator) -> None:
     """Points differ in how often they are found, which their history before has shown."""
     wrong, called = 0, 0

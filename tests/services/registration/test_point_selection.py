@@ -49,6 +49,7 @@ def tried(scene: Scene, points: ControlPoints, sigma_m: float) -> ControlPoints:
     return points.take(rows)
 
 
+@pytest.mark.long
 def test_an_accurate_scene_is_tried_on_points_that_it_shows() -> None:
     scene, points = small_scene(), block()[0]
     chosen = tried(scene, points, 0.5)

@@ -72,6 +72,7 @@ def pixels_of(shape: tuple[int, int]) -> Array:
 
 
 @pytest.mark.parametrize("name", DISTORTIONS)
+@pytest.mark.long
 def test_the_inverse_gives_back_every_pixel_that_is_shown_once(name: str) -> None:
     distortion = DISTORTIONS[name]
     pixels = pixels_of(distortion.shape)

@@ -181,6 +181,7 @@ def correlations(world: World, first: SimulatedView, second: SimulatedView) -> n
     return np.array(scores)
 
 
+@pytest.mark.long
 def test_two_views_of_one_day_correlate(world: World) -> None:
     rng = np.random.default_rng(0)
     first = simulate_view(world, plan(world), rng)
@@ -188,6 +189,7 @@ def test_two_views_of_one_day_correlate(world: World) -> None:
     assert np.median(correlations(world, first, second)) > 0.85
 
 
+@pytest.mark.long
 def test_views_of_different_days_correlate_less_but_mostly_well(world: World) -> None:
     rng = np.random.default_rng(0)
     first = simulate_view(world, plan(world, acquired_at=SUMMER), rng)
@@ -220,6 +222,7 @@ def test_the_rpc_fits_the_true_model(world: World) -> None:
     assert error_px.max() < a_hundredth_of_a_pixel
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_images(world: World) -> None:
     first, again = (
         simulate_block(world, np.random.default_rng(7), n_views=2, shape=(150, 150)) for _ in range(2)

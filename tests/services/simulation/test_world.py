@@ -18,6 +18,7 @@ def world() -> World:
     return make_world(np.random.default_rng(8), size_m=800.0, relief_m=50.0)
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_world(world: World) -> None:
     again = make_world(np.random.default_rng(8), size_m=800.0, relief_m=50.0)
     other = make_world(np.random.default_rng(9), size_m=800.0, relief_m=50.0)

@@ -181,6 +181,7 @@ def registered(frame: Frame = UNKNOWN_FRAME) -> CorrectionAccuracy:
     return CorrectionAccuracy(no_correction(SHAPE), covariance, np.array([0.2, 0.3]), frame, 0.0)
 
 
+@pytest.mark.long
 def test_the_stated_precision_is_honest() -> None:
     """Draws of all errors: of the model, the frame, the heights of the terrain and the operator."""
     rng = np.random.default_rng(7)

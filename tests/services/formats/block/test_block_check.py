@@ -217,6 +217,7 @@ def test_a_truncated_table_is_refused(block, name, keep):
 
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
+@pytest.mark.long
 def test_garbled_tables_raise_nothing_but_format_errors(tmp_path_factory, data):
     folder = tmp_path_factory.getbasetemp() / "garbled"
     if not folder.exists():

@@ -19,6 +19,7 @@ a_micrometre = 1e-6
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.long
 def test_gdal_reads_each_page_like_the_geotiff_of_the_single_chip(tmp_path, dtype):
     folder = make_block(tmp_path / "block", count=5, dtype=dtype).folder
     points, chips = read_block(folder).points, FolderChips(folder)

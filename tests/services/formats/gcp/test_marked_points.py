@@ -128,6 +128,7 @@ def test_what_is_written_is_the_golden_file(write, parse, golden: str) -> None:
 @every_format
 @given(data=st.data())
 @settings(max_examples=60)
+@pytest.mark.long
 def test_any_point_survives_a_round_trip(write, parse, golden: str, data: st.DataObject) -> None:
     n = data.draw(st.integers(0, 4))
     pixel = st.floats(-1e5, 1e6)
@@ -399,6 +400,7 @@ def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", FILES)
 @given(data=st.data())
 @settings(max_examples=60)
+@pytest.mark.long
 def test_a_garbled_file_gives_points_or_an_amers_error(name: str, data: st.DataObject) -> None:
     text = TEXTS[name]
     start = data.draw(st.integers(0, len(text)))

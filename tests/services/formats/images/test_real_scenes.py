@@ -49,6 +49,7 @@ def ground_of(model: RpcModel, extent: float = 1.0) -> Array:
     return model.ground_offset + normalised * model.ground_scale
 
 
+@pytest.mark.long
 def test_every_real_model_passes_its_check_and_agrees_with_another_reader(real_data: Path) -> None:
     dimap, text = files(real_data, DIMAP), files(real_data, TEXT)
     assert (len(dimap), len(text)) >= (44, 15)
@@ -218,6 +219,7 @@ def matched(a: Scene, b: Scene) -> tuple[Array, Array]:
         ("phr_iceland_pair", ("img_01.tif", "img_02.tif"), 0.26, (1460.0, 1560.0)),
     ],
 )
+@pytest.mark.long
 def test_the_rays_of_a_pair_intersect_at_plausible_heights(
     real_data: Path,
     folder: str,

@@ -33,6 +33,7 @@ def level_of(path: Path, index: TileIndex, number: int) -> npt.NDArray[np.uint8]
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (300, 511), (512, 512), (513, 1025), (1400, 2301)])
+@pytest.mark.long
 def test_each_level_is_the_mean_of_the_one_before(tmp_path: Path, shape: tuple[int, int]) -> None:
     index = write_tiles(ArrayImage(scene(*shape)), tmp_path / "tiles.bin")
     assert (index.lines, index.samples) == shape

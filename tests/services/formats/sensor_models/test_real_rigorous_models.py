@@ -37,6 +37,7 @@ def test_worldview_agrees_with_the_rpc_of_the_vendor(metadata: Path, name: str) 
 
 
 @pytest.mark.parametrize("name", oracles.SPOT)
+@pytest.mark.long
 def test_spot_agrees_with_its_frame_corners_up_to_the_attitude_they_leave_out(
     metadata: Path, name: str
 ) -> None:
@@ -56,6 +57,7 @@ def test_spot_2_agrees_with_the_rpc_that_another_tool_fitted_to_the_same_metadat
 
 
 @pytest.mark.parametrize("pattern", ["**/PHRDIMAP*.XML", "**/SP*.DIM", "**/SPOT6.XML", "**/WV*.XML"])
+@pytest.mark.long
 def test_free_parameters_of_real_models_move_them_as_predicted(metadata: Path, pattern: str) -> None:
     rng = np.random.default_rng(3)
     files = sorted(metadata.glob(pattern))

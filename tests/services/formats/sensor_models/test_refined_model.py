@@ -194,6 +194,7 @@ def test_an_rpc_that_does_not_fit_the_model_is_refused_with_its_error() -> None:
     assert refused.model is None
 
 
+@pytest.mark.long
 def test_residual_vectors_open_in_a_gis_with_heights_and_reference_system(
     registered, tmp_path: Path
 ) -> None:

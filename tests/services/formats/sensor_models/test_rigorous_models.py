@@ -46,6 +46,7 @@ def test_the_model_of_a_simulated_satellite_is_read_from_its_metadata(product: s
 
 
 @pytest.mark.parametrize("product", PRODUCTS)
+@pytest.mark.long
 def test_truncated_and_garbled_metadata_are_refused_or_read(product: str) -> None:
     write, read, light_path = PRODUCTS[product]
     text = write(simulated.truth(light_path))

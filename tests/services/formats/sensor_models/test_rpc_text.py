@@ -56,11 +56,13 @@ def test_rpb_and_text_hold_the_same_model() -> None:
 
 
 @given(models)
+@pytest.mark.long
 def test_every_number_survives_the_text(model: RpcModel) -> None:
     assert_same(parse_rpc_text(format_rpc_text(model)), model)
 
 
 @given(models)
+@pytest.mark.long
 def test_every_number_survives_the_rpb(model: RpcModel) -> None:
     text = format_rpb(model, "GE01")
     assert_same(parse_rpb(text), model)
