@@ -47,7 +47,7 @@ def missed_along(position: Array, agrees: BoolArray, tried: BoolArray) -> BoolAr
 def _least_likely_interval(agrees: BoolArray) -> IntArray:
     """The run of points (n,) in which the fewest agree for chance; none where chance explains all."""
     nothing = np.zeros(0, dtype=np.int64)
-    if agrees.all() or not agrees.any():
+    if agrees.all():
         return nothing
     fails = np.concatenate([[False], ~agrees, [False]])
     start = np.flatnonzero(fails[1:-1] & ~fails[:-2])

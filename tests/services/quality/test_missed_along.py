@@ -37,6 +37,27 @@ def test_a_band_of_lost_lines_is_found_with_its_borders(first: float) -> None:
         assert (missed & ~lost).sum() <= 8
 
 
+def test_an_image_turned_by_180_degrees_has_lost_the_same_lines() -> None:
+    rng = np.random.default_rng(14)
+    found = 0
+    for number in range(300):
+        line = places(rng, 60)
+        first, lines = (0.0 if number % 2 else rng.uniform(0.0, LINES)), rng.uniform(200.0, 600.0)
+        lost = (line >= first) & (line < first + lines) & (rng.random(60) < 0.95)
+        agrees = (rng.random(60) < 0.7) & ~lost
+        tried = np.ones(60, dtype=bool)
+        missed = missed_along(line, agrees, tried)
+        found += missed.any()
+        np.testing.assert_array_equal(missed_along(LINES - line, agrees, tried), missed)
+    assert 60 <= found <= 240, "bands that are clear and bands that chance may explain"
+
+
+@pytest.mark.parametrize("agree", [True, False])
+def test_where_all_points_agree_or_none_does_no_lines_are_told_from_others(agree: bool) -> None:
+    line = places(np.random.default_rng(15), 60)
+    assert not missed_along(line, np.full(60, agree), np.ones(60, dtype=bool)).any()
+
+
 def test_two_bands_are_both_found() -> None:
     rng = np.random.default_rng(12)
     line = places(rng, 200)
