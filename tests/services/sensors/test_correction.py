@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.interpolate import RegularGridInterpolator
 
 from services.formats.sensor_models.rpc_text import parse_rpc_text
 from services.sensors.correction import CorrectedModel, ImageCorrection, fold_into_rpc, no_correction
@@ -18,6 +19,8 @@ SHAPE = (26000, 26500)
 a_nanopixel = 1e-9
 rounding_of_the_image_px = 1e-8
 """Some hundred roundings of a coordinate of 26,000 px."""
+
+a_fiftieth_of_its_size = 0.02
 
 pixels = st.floats(-100.0, 100.0)
 
@@ -111,6 +114,56 @@ def test_a_displacement_is_constant_beyond_its_nodes_and_so_is_its_derivative() 
     np.testing.assert_allclose(derivative, np.stack(by_difference, axis=-1), atol=a_nanopixel)
     assert not derivative[-3].any()
     np.testing.assert_array_equal(grid.at(outside[4:]), grid.at(np.array([[200.0, 300.0]])))
+
+
+def uneven_grid() -> DisplacementGrid:
+    """Random displacements at nodes that are not evenly apart."""
+    rng = np.random.default_rng(1)
+    nodes = [np.cumsum(rng.uniform(20.0, 90.0, count)) for count in (6, 5)]
+    return DisplacementGrid(*nodes, *rng.normal(size=(2, 6, 5, 2)))
+
+
+def inside(grid: DisplacementGrid, margin: float) -> np.ndarray:
+    """Positions (200, 2) within the nodes."""
+    low, high = (
+        np.array([nodes[end] for nodes in (grid.line, grid.sample)]) + shift
+        for end, shift in ((0, margin), (-1, -margin))
+    )
+    return low + np.random.default_rng(2).random((200, 2)) * (high - low)
+
+
+@pytest.mark.parametrize("of", ["displacement_px", "variance_px2"])
+def test_a_displacement_is_bilinear_between_its_nodes_as_another_library_has_it(of: str) -> None:
+    grid = uneven_grid()
+    at = np.concatenate([inside(grid, 0.0), [[grid.line[2], grid.sample[3]]]])
+    expected = RegularGridInterpolator((grid.line, grid.sample), getattr(grid, of))(at)
+    found = grid.at(at) if of == "displacement_px" else grid.variance_at(at)
+    np.testing.assert_allclose(found, expected, atol=a_nanopixel)
+
+
+def test_the_derivative_of_a_displacement_is_that_of_its_differences() -> None:
+    grid, step = uneven_grid(), 1e-3
+    at = inside(grid, 1.0)
+    near_a_node = [
+        np.abs(at[:, k, None] - nodes).min(axis=1) for k, nodes in enumerate((grid.line, grid.sample))
+    ]
+    beyond = [
+        inside(grid, 1.0)[:5] + shift for shift in 1e4 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    ]
+    at = np.concatenate([at[np.min(near_a_node, axis=0) > step], *beyond])
+    by_difference = [(grid.at(at + one) - grid.at(at - one)) / (2.0 * step) for one in step * np.eye(2)]
+    np.testing.assert_allclose(grid.derivative(at), np.stack(by_difference, axis=-1), atol=a_nanopixel)
+
+
+def test_a_chip_shows_the_mean_of_what_lies_under_it_where_lines_and_samples_move_apart() -> None:
+    nodes = np.linspace(0.0, 400.0, 401)
+    moved = np.sin(nodes / 25.0)[:, None, None] * [1.0, 0.5] + np.cos(nodes / 40.0)[:, None] * [0.5, 1.0]
+    grid = DisplacementGrid(nodes, nodes, moved, np.zeros_like(moved))
+    middles, side = np.random.default_rng(3).uniform(60.0, 340.0, (20, 2)), 80.0
+    over = (np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 101)] * 2), -1) * side).reshape(-1, 2)
+    means = [grid.at(middle + over).mean(axis=0) for middle in middles]
+    np.testing.assert_allclose(grid.averaged(middles, side), means, atol=a_fiftieth_of_its_size)
+    assert np.abs(grid.at(middles) - means).max() > 0.3
 
 
 def test_no_correction_changes_nothing() -> None:
