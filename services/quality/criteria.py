@@ -126,33 +126,37 @@ _DESCRIPTIONS = {
         "Steps along the lines",
         "px",
         2,
-        "The same for a step at some line.",
+        "Largest step of the residuals at some line; 0 where chance shows one as clearly. The limit is "
+        "a tenth of the predicted CE90.",
     ),
     "structure_along_samples": _Description(
         "Residuals along the samples",
         "px",
         2,
-        "As along the lines: seams between detectors and distortions of the optics show here. The limit "
-        "is half of the predicted CE90 for good, twice it for usable.",
+        "Largest displacement by a swing or bend along the samples that residuals show; 0 where chance "
+        "shows one as clearly. Seams between detectors and distortions of the optics show here. The "
+        "limit is half of the predicted CE90 for good, twice it for usable.",
     ),
     "steps_along_samples": _Description(
         "Steps along the samples",
         "px",
         2,
-        "As along the samples, for a step at some sample: a seam between two detectors.",
+        "Largest step of the residuals at some sample, a seam between two detectors; 0 where chance "
+        "shows one as clearly. Limits as for residuals along the samples.",
     ),
     "structure_in_image": _Description(
         "Residuals over the image",
         "px",
         2,
-        "As along the samples, for waves in two dimensions.",
+        "Largest displacement by waves in two dimensions that residuals show; 0 where chance shows one "
+        "as clearly. Limits as for residuals along the samples.",
     ),
     "structure_against_height": _Description(
         "Residuals against height",
         "px",
         2,
-        "The same for what grows with the height of the points: the lines of sight of the model are "
-        "not those of the image.",
+        "Largest displacement that grows with the height of the points, as where the lines of sight of "
+        "the model are not those of the image; 0 where chance shows one as clearly.",
     ),
     "structure_within_chips": _Description(
         "Motion within the chips",
@@ -182,7 +186,7 @@ _DESCRIPTIONS = {
         "Samples whose points do not agree",
         "%",
         0,
-        "The same for samples: detectors out of place show here.",
+        "As for the lines, between samples: detectors out of place show here. Usable up to 10 %.",
     ),
     "points_elsewhere": _Description(
         "Points that agree elsewhere",
