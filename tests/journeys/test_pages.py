@@ -1,0 +1,93 @@
+"""The pages of the service beside the map, and the reports: accessible, and as wide as a phone."""
+
+from pathlib import Path
+
+import pytest
+import rasterio
+from playwright.sync_api import Browser, expect
+
+from tests.app.flat_world import FlatWorld
+from tests.command_line import amers_here
+from tests.journeys.conftest import Amers
+from tests.journeys.map_page import assert_readable
+from tests.service_process import Service, installed_at
+
+pytestmark = pytest.mark.long
+
+PAGES = {
+    "landing": "/",
+    "api": "/api",
+    "connect": "/connect",
+    "conformance": "/conformance",
+    "collections": "/collections",
+    "collection": "/collections/points",
+    "points-table": "/collections/points/items",
+    "blocks-table": "/collections/blocks/items",
+}
+"""Addresses of pages by the names of their pictures."""
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_of_the_service_is_readable(name, browser: Browser, service: Service, world, secret):
+    with browser.new_context(http_credentials={"username": "any", "password": secret}) as context:
+        page = context.new_page()
+        page.goto(f"{service.url}{PAGES[name]}")
+        expect(page.get_by_role("heading", level=1)).to_be_visible()
+        assert_readable(page, f"page-{name}")
+
+
+def test_the_page_of_a_point_and_the_form_to_sign_in_are_readable(
+    browser: Browser, service: Service, world, secret
+):
+    with browser.new_context(http_credentials={"username": "any", "password": secret}) as context:
+        page = context.new_page()
+        page.goto(f"{service.url}/collections/points/items?f=html")
+        page.locator("table a").first.click()
+        expect(page.get_by_role("img").first).to_be_visible()
+        assert_readable(page, "page-point")
+    with browser.new_context() as context:
+        page = context.new_page()
+        page.goto(f"{service.url}/sign-in")
+        assert_readable(page, "page-sign-in")
+
+
+@pytest.fixture(scope="module")
+def reports(
+    world: FlatWorld, installation: Path, amers: Amers, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Path]:
+    """Reports by the names of their pictures: of scenes, one of other ground, and of a block."""
+    folder = tmp_path_factory.mktemp("reports")
+    with rasterio.open(world.tagged) as scene:
+        pixels, profile, model = scene.read(1), scene.profile, scene.rpcs
+    for name, ground in (("right", pixels), ("wrong", pixels[:, ::-1].T)):
+        with rasterio.open(folder / f"{name}.tif", "w", **profile) as copy:
+            copy.write(ground, 1)
+            copy.rpcs = model
+    words = ("scene", "register", folder / "right.tif", folder / "wrong.tif", "-o", folder / "out")
+    registered = amers_here((*words, "--sigma-m", "6"), installed_at(installation / "data"))
+    assert registered.returncode != 0, "one of two scenes cannot be registered"
+    amers("block", "quality", world.block, "-o", folder / "quality")
+    return {
+        "registration": folder / "out" / "right" / "report.html",
+        "failure": folder / "out" / "wrong" / "report.html",
+        "overview": folder / "out" / "overview.html",
+        "block-quality": folder / "quality" / "block_quality.html",
+    }
+
+
+@pytest.mark.parametrize("name", ["registration", "failure", "overview", "block-quality"])
+def test_a_report_is_readable(name, browser: Browser, reports):
+    with browser.new_context() as context:
+        page = context.new_page()
+        page.goto(reports[name].as_uri())
+        expect(page.get_by_role("heading", level=1)).to_be_visible()
+        assert_readable(page, f"report-{name}")
+
+
+def test_the_residual_vectors_of_a_report_end_at_the_edges_of_the_image(browser: Browser, reports):
+    """Styles of the drawing of a figure must not reach the drawing inside it, which cuts the vectors."""
+    with browser.new_context() as context:
+        page = context.new_page()
+        page.goto(reports["registration"].as_uri())
+        vectors = page.locator("figure > svg > svg").first
+        assert vectors.evaluate("drawing => getComputedStyle(drawing).overflow") == "hidden"
