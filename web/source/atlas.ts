@@ -13,9 +13,9 @@ import {
 import { authorization, BASE, get } from "./api";
 import { Comparison, type Pyramids } from "./comparison";
 import { h } from "./elements";
-import { goToField } from "./go_to";
+import { goToField, TOWNS } from "./go_to";
 import { degrees, graticule, wrapped } from "./graticule";
-import { type Colouring, landFile, mapStyle } from "./style";
+import { type Colouring, landFile, mapStyle, TOWNS_ZOOM } from "./style";
 
 export type Bounds = [west: number, south: number, east: number, north: number];
 
@@ -35,6 +35,8 @@ interface Background {
   attribution: string | null;
 }
 
+const MAKER_OF_TOWNS = "Towns: GeoNames, CC BY 4.0";
+
 /** Paths below which tiles are for some callers only. */
 const PROTECTED = ["collections/", "jobs/"];
 
@@ -44,6 +46,7 @@ export class Atlas {
   private readonly ready: Promise<void>;
   private colouring: Colouring = "none";
   private land = landFile(0);
+  private namesTowns = false;
   /** Whether the reader has gone to a place: the page then does not move the map by itself. */
   went = false;
 
@@ -57,6 +60,7 @@ export class Atlas {
     this.ready = new Promise((resolve) => map.once("load", () => resolve()));
     void this.ready.then(() => this.whileMoving(() => this.drawGraticule(map), new AbortController().signal));
     void this.ready.then(() => this.whileMoving(() => this.drawLand(map), new AbortController().signal));
+    void this.ready.then(() => this.whileMoving(() => this.drawTowns(map, container), new AbortController().signal));
     void this.ready.then(() => drawBackground(map, container)).catch((error: Error) => console.warn(error.message));
     for (const event of ["movestart", "dataloading"] as const) map.on(event, () => container.setAttribute("aria-busy", "true"));
     map.on("idle", () => container.setAttribute("aria-busy", "false"));
@@ -167,6 +171,15 @@ export class Atlas {
     source.setData(BASE + file);
   }
 
+  /** Load the towns when the map first comes so close that it names them. */
+  private drawTowns(map: MapLibre, container: HTMLElement): void {
+    const source = map.getSource("towns");
+    if (this.namesTowns || map.getZoom() < TOWNS_ZOOM || !(source instanceof GeoJSONSource)) return;
+    this.namesTowns = true;
+    source.setData(BASE + TOWNS);
+    attribute(container, MAKER_OF_TOWNS);
+  }
+
   private drawGraticule(map: MapLibre): void {
     const seen = map.getBounds();
     const corner = map.unproject([LABELS_PX.left, map.getContainer().clientHeight - LABELS_PX.bottom]);
@@ -191,7 +204,14 @@ async function drawBackground(map: MapLibre, container: HTMLElement): Promise<vo
   const address = tiles.startsWith("/") ? location.origin + tiles : tiles;
   map.addSource("background", { type: "raster", tiles: [address], tileSize: 256 });
   map.addLayer({ id: "background", type: "raster", source: "background" }, "density");
-  container.prepend(h("p", { class: "attribution" }, attribution));
+  attribute(container, attribution ?? "");
+}
+
+/** Name on the map who made a part of it. */
+function attribute(container: HTMLElement, maker: string): void {
+  const line = container.querySelector(".attribution");
+  if (line) line.append(` · ${maker}`);
+  else container.prepend(h("p", { class: "attribution" }, maker));
 }
 
 function opened(container: HTMLElement): MapLibre | null {

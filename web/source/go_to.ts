@@ -1,4 +1,4 @@
-// Go to a coordinate or to a country: one field on the map.
+// Go to a coordinate, a country or a town: one field on the map.
 
 import type { Feature, FeatureCollection, Point, Position } from "geojson";
 import { get } from "./api";
@@ -6,10 +6,12 @@ import { h, problem } from "./elements";
 import { degrees } from "./graticule";
 import { announce } from "./place";
 
-/** A country: its name, and the box of its largest part. */
-type Country = Feature<Point, { name: string; box: [west: number, south: number, east: number, north: number] }>;
+/** A country with the box of its largest part, or a town, which has none. */
+type Named = Feature<Point, { name: string; box?: [west: number, south: number, east: number, north: number] }>;
 
 export const COUNTRIES = "map/countries.json";
+/** Towns of 20,000 inhabitants or more, the largest first. */
+export const TOWNS = "map/towns.json";
 const NUMBER = "([+-]?\\d+(?:\\.\\d+)?)\\s*°?\\s*([NSEW]?)";
 const COORDINATE = new RegExp(`^${NUMBER}[\\s,;]+${NUMBER}$`);
 
@@ -21,14 +23,14 @@ export function goToField(toPosition: (position: Position) => void, toBox: (corn
     type: "search",
     id: "go-to",
     list: "countries",
-    placeholder: "48.85, 2.35 or a country",
+    placeholder: "48.85, 2.35, a country or a town",
     enterkeyhint: "go",
     autocomplete: "off",
-    onfocus: () => void countries().then(offer, () => undefined),
+    onfocus: () => void named(COUNTRIES).then(offer, () => undefined),
   });
   return h("form", { class: "go-to", role: "search", onsubmit: (event) => void submit(event) }, h("label", { for: "go-to" }, "Go to"), input, names, message);
 
-  function offer(found: Country[]): void {
+  function offer(found: Named[]): void {
     if (!names.children.length) names.append(...found.map(({ properties: { name } }) => h("option", { value: name })));
   }
 
@@ -42,13 +44,17 @@ export function goToField(toPosition: (position: Position) => void, toBox: (corn
       announce(`The map shows ${degrees(position[1]!, "N", "S", 4)}, ${degrees(position[0]!, "E", "W", 4)}.`);
       return;
     }
-    const country = text ? find(await countries().catch(() => []), text) : undefined;
-    if (!country) {
-      message.append(problem(`“${text}” is no country and no coordinate. Write latitude, then longitude, in degrees, as in 48.85, 2.35.`));
+    const lists = await Promise.all([COUNTRIES, TOWNS].map((list) => named(list).catch(() => [])));
+    const found = text ? find(lists.flat(), text) : undefined;
+    if (!found) {
+      message.append(
+        problem(`“${text}” is no country, no town that the map names and no coordinate. Write latitude, then longitude, in degrees, as in 48.85, 2.35.`),
+      );
       return;
     }
-    const { box, name } = country.properties;
-    toBox([box.slice(0, 2), box.slice(2)]);
+    const { box, name } = found.properties;
+    if (box) toBox([box.slice(0, 2), box.slice(2)]);
+    else toPosition(found.geometry.coordinates);
     announce(`The map shows ${name}.`);
   }
 }
@@ -67,17 +73,17 @@ function signed(number: string, letter: string): number {
   return /[SW]/.test(letter) ? -Number(number) : Number(number);
 }
 
-async function countries(): Promise<Country[]> {
-  return (await get<FeatureCollection & { features: Country[] }>(COUNTRIES)).features;
+async function named(list: string): Promise<Named[]> {
+  return (await get<FeatureCollection & { features: Named[] }>(list)).features;
 }
 
-/** The country of a name, or the first whose name begins with the text, or contains it. */
-function find(countries: Country[], text: string): Country | undefined {
+/** The first place of a name, or the first whose name begins with the text, or contains it. */
+function find(places: Named[], text: string): Named | undefined {
   const wanted = plain(text);
   const matches: ((name: string) => boolean)[] = [(name) => name === wanted, (name) => name.startsWith(wanted), (name) => name.includes(wanted)];
   for (const match of matches) {
-    const country = countries.find(({ properties: { name } }) => match(plain(name)));
-    if (country) return country;
+    const place = places.find(({ properties: { name } }) => match(plain(name)));
+    if (place) return place;
   }
   return undefined;
 }

@@ -15,6 +15,9 @@ const TILES_ZOOM = 14;
 const LAST_DENSITY_ZOOM = 11;
 /** Countries smaller than this, in square degrees, have no name on a map of the world. */
 const SMALL_DEG2 = 10;
+/** Lowest zoom with names of towns, and the smallest towns, by their inhabitants, that have them from a zoom on. */
+export const TOWNS_ZOOM = 4;
+const TOWNS_FROM: ExpressionSpecification = ["step", ["zoom"], 1_000_000, 5, 300_000, 6, 100_000, 7, 50_000, 8, 0];
 const FONT = ["system-ui", "sans-serif"];
 
 /** What colours the points: classes from the best to the worst, as their tiles have the property. */
@@ -91,6 +94,7 @@ export function mapStyle(dark: boolean, colouring: Colouring): StyleSpecificatio
     sources: {
       land: { type: "geojson", data: BASE + landFile(0) },
       countries: { type: "geojson", data: BASE + COUNTRIES },
+      towns: empty(),
       graticule: empty(),
       target: empty(),
       density: { type: "vector", tiles: [`${BASE}collections/density/${TILES}`], maxzoom: TILES_ZOOM },
@@ -139,6 +143,23 @@ function layers(dark: boolean, colouring: Colouring): LayerSpecification[] {
       },
     },
     { id: "graticule", type: "line", source: "graticule", paint: { "line-color": c.quiet, "line-opacity": 0.35, "line-width": 0.7 } },
+    {
+      id: "towns",
+      type: "symbol",
+      source: "towns",
+      filter: [">=", ["get", "population"], TOWNS_FROM],
+      layout: {
+        "text-field": ["get", "name"],
+        "text-font": FONT,
+        "text-size": ["step", ["get", "population"], 11, 300_000, 13],
+        // Below its place, where a mark of the place leaves it readable.
+        "text-anchor": "top",
+        "text-offset": [0, 0.8],
+        "text-padding": 6,
+        "symbol-sort-key": ["-", ["get", "population"]],
+      },
+      paint: { "text-color": c.text, "text-halo-color": c.land, "text-halo-width": 1.2 },
+    },
     {
       id: "countries",
       type: "symbol",
