@@ -13,11 +13,13 @@ from services.geodesy import (
     lon_lat_h_from_east_north_up,
     lon_lat_h_from_ecef,
     metres_per_degree,
+    move_metres,
 )
 from services.types import Array
 
 a_micrometre = 1e-6
 a_micrometre_deg = a_micrometre / 111_000.0
+a_tenth_of_a_millimetre = 1e-4
 a_millimetre = 1e-3
 
 GEODETIC, GEOCENTRIC = "EPSG:4979", "EPSG:4978"
@@ -117,3 +119,14 @@ def test_the_length_of_a_degree_grows_with_the_height() -> None:
     above = ecef_from_lon_lat_h(np.array([[5.0, 43.0, 3000.0], [5.000_1, 43.0, 3000.0]]))
     east_m, _ = metres_per_degree(43.0, 3000.0)
     assert np.linalg.norm(above[1] - above[0]) == pytest.approx(east_m * 1e-4, abs=a_micrometre)
+
+
+@pytest.mark.parametrize("height_m", [-100.0, 0.0, 8000.0])
+def test_a_move_in_metres_is_that_of_the_frame_east_north_and_up(height_m: float) -> None:
+    at = np.array([[179.999, -43.0, height_m], [5.4, 60.0, height_m], [-70.0, 0.0, height_m]])
+    step_m = np.array([[3.0, -4.0, 2.0], [-5.0, 1.0, -3.0], [2.0, 6.0, 0.0]])
+    expected = [lon_lat_h_from_east_north_up(step_m[k : k + 1], at[k])[0] for k in range(3)]
+    apart = [
+        east_north_up(move_metres(at, step_m)[k : k + 1], np.array(expected[k]))[0] for k in range(3)
+    ]
+    assert np.abs(apart).max() < a_tenth_of_a_millimetre

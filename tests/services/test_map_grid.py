@@ -73,7 +73,14 @@ def test_positions_outside_the_map_are_nan() -> None:
 
 @pytest.mark.parametrize(
     ("lon", "lat", "zone"),
-    [(5.4, 43.6, "EPSG:32631"), (-180.0, -1.0, "EPSG:32701"), (179.9, 1.0, "EPSG:32660")],
+    [
+        (5.4, 43.6, "EPSG:32631"),
+        (-180.0, -1.0, "EPSG:32701"),
+        (179.9, 1.0, "EPSG:32660"),
+        (180.0, 0.5, "EPSG:32601"),
+        (5.999, -0.5, "EPSG:32731"),
+        (6.0, 0.0, "EPSG:32632"),
+    ],
 )
 def test_every_position_has_its_utm_zone(lon: float, lat: float, zone: str) -> None:
     assert utm_of(lon, lat) == zone

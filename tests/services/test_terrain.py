@@ -152,6 +152,38 @@ def test_a_line_of_sight_ends_on_the_side_of_a_ridge_the_sensor_sees() -> None:
     assert hidden_by_m.max() < a_millimetre
 
 
+def test_a_line_of_sight_passes_through_no_tower_of_a_plain() -> None:
+    """Most of the ground is far below a line, and is skipped; here and there a tower stands."""
+    rng = np.random.default_rng(5)
+    heights = rng.uniform(0.0, 5.0, SHAPE).astype(np.float32)
+    for row, column in rng.integers(4, np.array(SHAPE) - 4, (60, 2)).tolist():
+        heights[row : row + 2, column : column + 2] = rng.uniform(100.0, 1500.0)
+    ground = Terrain(GRID, ArrayImage(heights))
+    lon, lat = GRID.lon_lat(np.array([[150.0, 140.0]]))[0]
+    on_towers = 0
+    for azimuth_deg in (20.0, 250.0):
+        model = pushbroom_over(
+            np.array([lon, lat, 0.0]), (400, 400), 2.0, (40.0, azimuth_deg), (-100.0, 1600.0)
+        )
+        met = intersect_terrain(model, pixels_of(), ground)
+        assert np.isfinite(met).all()
+        on_towers += (met[:, 2] > 20.0).sum()
+        for height_m in np.arange(1.0, 1600.0, 3.0):
+            place = model.locate(pixels_of(), np.full(len(met), height_m))
+            above = height_m > met[:, 2] + a_millimetre
+            assert not (ground.height_m(place[above, :2]) > height_m + a_millimetre).any()
+    assert on_towers > 10
+
+
+def test_no_height_is_asked_of_a_geoid_where_none_is_known() -> None:
+    def geoid(lon_lat: Array) -> Array:
+        assert len(lon_lat)
+        return np.full(len(lon_lat), 50.0)
+
+    ground = replace(terrain(), geoid=geoid)
+    assert np.isnan(ground.height_m(np.array([[170.0, 10.0]]))).all()
+
+
 def test_a_line_of_sight_that_leaves_the_grid_or_enters_a_void_has_no_intersection() -> None:
     heights = hills(60.0)
     heights[:, :140] = np.nan
