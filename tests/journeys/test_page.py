@@ -21,6 +21,7 @@ from tests.factories import make_block
 from tests.journeys.map_page import (
     ARTEFACTS,
     AXE,
+    DESKTOP,
     PHONE,
     WIDE,
     assert_readable,
@@ -64,7 +65,7 @@ def vectors_drawn_px(page: Page) -> int:
 def test_a_scene_goes_from_upload_to_report_with_the_keyboard_alone(visit, world, secret, service):
     page = visit()
     expect(page.get_by_role("heading", name="Sign in")).to_be_visible()
-    page.screenshot(path=ARTEFACTS / "sign-in.png")
+    look(page, "journey-1-sign-in")
     tab_to(page, "Token")
     page.keyboard.type(secret)
     page.keyboard.press("Enter")
@@ -79,7 +80,7 @@ def test_a_scene_goes_from_upload_to_report_with_the_keyboard_alone(visit, world
     page.locator(":focus").set_input_files(world.rpc_text)
     tab_to(page, "Accuracy")
     page.keyboard.type("6")
-    page.screenshot(path=ARTEFACTS / "upload.png")
+    look(page, "journey-2-scene")
     tab_to(page, "Upload and register")
     page.keyboard.press("Enter")
 
@@ -94,14 +95,23 @@ def test_a_scene_goes_from_upload_to_report_with_the_keyboard_alone(visit, world
     assert page.locator("tbody tr").count() == len(report["criteria"])
     assert until(lambda: vectors_drawn_px(page) >= enough_px)
     until_drawn(page)
-    page.screenshot(path=ARTEFACTS / "report.png")
+    look(page, "journey-3-registered")
 
     tab_to(page, "Open the report")
     with page.context.expect_page() as opened:
         page.keyboard.press("Enter")
     opened.value.wait_for_load_state()
     expect(opened.value.locator("body")).to_contain_text(report["verdict"])
-    opened.value.screenshot(path=ARTEFACTS / "report-page.png")
+    look(opened.value, "journey-4-report")
+
+
+def look(page: Page, step: str) -> None:
+    """Check a step of the journey at both widths, light and dark, and keep its pictures; then go on."""
+    page.evaluate("window.focused = document.activeElement")
+    assert_readable(page, step)
+    assert page.evaluate("document.activeElement === window.focused"), "the focus stays where it was"
+    page.emulate_media(color_scheme="light")
+    page.set_viewport_size(DESKTOP)
 
 
 def assert_accuracy_shown(page: Page, document: dict) -> None:
