@@ -23,7 +23,7 @@ export function goToField(toPosition: (position: Position) => void, toBox: (corn
     type: "search",
     id: "go-to",
     list: "countries",
-    placeholder: "48.85, 2.35, a country or a town",
+    placeholder: "48.85, 2.35 or a place",
     enterkeyhint: "go",
     autocomplete: "off",
     onfocus: () => void named(COUNTRIES).then(offer, () => undefined),
