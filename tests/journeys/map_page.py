@@ -14,6 +14,8 @@ PHONE: ViewportSize = {"width": 390, "height": 844}
 patience_ms = 90_000
 most_stops = 80
 poll_ms = 100
+tallest_picture_px = 8_000
+"""Chromium draws a page again from its beginning where a picture is taller than a texture, 8192 px."""
 
 
 def is_error(message: ConsoleMessage, refused: int) -> bool:
@@ -49,10 +51,21 @@ def assert_readable(page: Page, view: str) -> None:
             page.wait_for_timeout(poll_ms)
             if has_map:
                 until_drawn(page)
-            # Pages without a map are longer than a window.
-            picture = ARTEFACTS / f"{view}-{size['width']}-{scheme}.png"
-            page.screenshot(path=picture, full_page=not has_map)
+            name = f"{view}-{size['width']}-{scheme}"
+            if has_map:
+                page.screenshot(path=ARTEFACTS / f"{name}.png")
+            else:
+                keep_whole_page(page, name)
             page.evaluate(AXE.read_text(encoding="utf-8"))
             findings = page.evaluate("axe.run().then((found) => found.violations)")
             assert [(found["id"], found["nodes"][0]["html"]) for found in findings] == [], view
         assert page.evaluate("document.documentElement.scrollWidth") <= size["width"], view
+
+
+def keep_whole_page(page: Page, name: str) -> None:
+    """Keep pictures of a page that is longer than its window, in parts where one would repeat itself."""
+    width, height = page.evaluate("[document.body.scrollWidth, document.documentElement.scrollHeight]")
+    for part, top in enumerate(range(0, height, tallest_picture_px), 1):
+        of_page = {"x": 0, "y": top, "width": width, "height": min(tallest_picture_px, height - top)}
+        path = ARTEFACTS / (f"{name}.png" if part == 1 else f"{name}-{part}.png")
+        page.screenshot(path=path, full_page=True, clip=of_page)
