@@ -5,11 +5,13 @@ from contextlib import chdir
 from pathlib import Path
 
 import pytest
+from playwright.sync_api import Browser, expect
 from pyproj import datadir
 
 from tests.command_line import Done, amers_here
 from tests.documents import blocks_of, command_lines
 from tests.journeys.guide_files import write_bases, write_geoids, write_guide_files
+from tests.journeys.map_page import assert_readable
 from tests.service_process import installed_at
 
 pytestmark = pytest.mark.long
@@ -69,6 +71,15 @@ def test_a_command_of_the_guide_runs_as_it_is_written(done, line):
 @pytest.mark.parametrize("line", OUTPUTS)
 def test_a_command_of_the_guide_writes_what_it_names(done, places, line):
     assert (places[line] / line.partition(" -o ")[2].split()[0]).exists()
+
+
+@pytest.mark.parametrize("folder", ["my-block.adjustment", "my-selection", "together/block"])
+def test_a_report_that_a_command_of_the_guide_writes_is_readable(done, places, folder, browser: Browser):
+    with browser.new_context() as context:
+        page = context.new_page()
+        page.goto((places[RUN[0]] / folder / "report.html").as_uri())
+        expect(page.get_by_role("heading", level=1)).to_be_visible()
+        assert_readable(page, "report-" + folder.replace("/", "-"))
 
 
 def test_a_command_that_is_not_run_stands_in_the_guide():

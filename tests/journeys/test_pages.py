@@ -1,5 +1,6 @@
 """The pages of the service beside the map, and the reports: accessible, and as wide as a phone."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,26 @@ PAGES = {
     "blocks-table": "/collections/blocks/items",
 }
 """Addresses of pages by the names of their pictures."""
+PLAN = {
+    "images": [
+        {
+            "name": name,
+            "lon": lon,
+            "lat": 43.3,
+            "along_km": 10.0,
+            "across_km": 10.0,
+            "gsd_m": 2.0,
+            "incidence_deg": 15.0,
+            "azimuth_deg": azimuth_deg,
+            "sigma_m": 6.0,
+        }
+        for name, lon, azimuth_deg in (("west", 5.4, 280.0), ("middle", 5.46, 100.0))
+    ],
+    "spacing_km": 1.0,
+    "sites": [{"name": "harbour", "lon": 5.4, "lat": 43.31}],
+    "candidates": {"spacing_km": 6.0},
+}
+"""Two images that see one place from both sides, one place that is known, and places that may be."""
 
 
 @pytest.mark.parametrize("name", PAGES)
@@ -55,7 +76,7 @@ def test_the_page_of_a_point_and_the_form_to_sign_in_are_readable(
 def reports(
     world: FlatWorld, installation: Path, amers: Amers, tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, Path]:
-    """Reports by the names of their pictures: of scenes, one of other ground, and of a block."""
+    """Reports by the names of their pictures: of scenes, one of other ground, a block, a plan."""
     folder = tmp_path_factory.mktemp("reports")
     with rasterio.open(world.tagged) as scene:
         pixels, profile, model = scene.read(1), scene.profile, scene.rpcs
@@ -67,15 +88,18 @@ def reports(
     registered = amers_here((*words, "--sigma-m", "6"), installed_at(installation / "data"))
     assert registered.returncode != 0, "one of two scenes cannot be registered"
     amers("block", "quality", world.block, "-o", folder / "quality")
+    (folder / "plan.json").write_text(json.dumps(PLAN))
+    amers("production", "plan", folder / "plan.json", "-o", folder / "plan")
     return {
         "registration": folder / "out" / "right" / "report.html",
         "failure": folder / "out" / "wrong" / "report.html",
         "overview": folder / "out" / "overview.html",
         "block-quality": folder / "quality" / "block_quality.html",
+        "plan": folder / "plan" / "report.html",
     }
 
 
-@pytest.mark.parametrize("name", ["registration", "failure", "overview", "block-quality"])
+@pytest.mark.parametrize("name", ["registration", "failure", "overview", "block-quality", "plan"])
 def test_a_report_is_readable(name, browser: Browser, reports):
     with browser.new_context() as context:
         page = context.new_page()
