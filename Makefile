@@ -38,7 +38,7 @@ test-files: $(READY)
 test-operations: $(READY)
 	$(BIN)/python -m pytest -q -n0 tests/app/test_openapi.py
 
-# No database, no journeys, no Monte Carlo tests, nothing long. It reports what it leaves out.
+# No database, no journeys, no Monte Carlo tests, nothing long, no endurance. It reports what it leaves out.
 test-fast: $(READY)
 	$(BIN)/python -m pytest --fast -n auto --dist loadfile --no-loadscope-reorder --durations 20
 
