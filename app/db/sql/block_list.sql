@@ -1,4 +1,5 @@
--- All blocks, the newest first, with what their accuracy follows from (app/db/block_list.py).
+-- All blocks, the newest first, with what their accuracy follows from (app/db/block_list.py). Where a document
+-- states its frame stands in app/db/blocks.py for SQLAlchemy, too.
 select number, id, version, title, state, priority, n_points, n_unserved, n_views, created_at,
     state_changed_at,
     cast(quality #>> '{sigma_horizontal_m,median}' as double precision) as sigma_horizontal_m,
