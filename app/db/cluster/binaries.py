@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from app.errors import InputError
@@ -124,6 +125,7 @@ def _candidate_folders() -> list[Path]:
     return list(dict.fromkeys(folder.resolve() for folder in folders))
 
 
+@cache
 def _inspect(folder: Path) -> Binaries | None:
     if not all((folder / name).is_file() for name in NEEDED):
         return None
