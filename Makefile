@@ -11,9 +11,12 @@ PAGE := app/web/built/index.html
 # Tests of services wait for them: three processes for two cores, whose number nproc does not tell where
 # OMP_NUM_THREADS is set. More would collect all tests once more each, and wait for the cores.
 WORKERS := $(shell expr $$(env -u OMP_NUM_THREADS nproc) \* 3 / 2)
+# The plugin of schemathesis takes two seconds to load, and only the tests of all operations need it.
+PYTEST := $(BIN)/python -m pytest -p no:schemathesis --dist loadfile --no-loadscope-reorder --durations 20
+APART := not endurance and not qgis
 LONG := cape_verde continent distorted faults image_selection load stress throughput block_adjustment toutin
 
-.PHONY: demo test test-files test-operations test-fast test-security test-endurance test-qgis check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput mutants postgis page chromium pictures plugin
+.PHONY: demo test test-thorough test-files test-operations test-fast test-security test-endurance test-qgis check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput mutants postgis page chromium pictures plugin
 
 demo: postgis
 	$(BIN)/amers demo
@@ -23,16 +26,19 @@ test: $(READY)
 	$(MAKE) --jobs 3 check kernels programs
 	$(MAKE) --jobs 2 test-files test-operations
 
+# Whole journeys, a browser, scenes that are registered again and again: what `make test` leaves out for its time.
+test-thorough: $(READY)
+	$(MAKE) --jobs 2 kernels programs
+	$(MAKE) chromium
+	$(PYTEST) -m "thorough and $(APART)" -n $(WORKERS)
+
 # One after the other: Debian's packages are installed by one process at a time.
 programs: $(READY)
 	$(MAKE) postgis
 	$(MAKE) page
-	$(MAKE) chromium
 
-# The plugin of schemathesis takes two seconds to load, and only the tests of all operations need it.
 test-files: $(READY)
-	$(BIN)/python -m pytest -p no:schemathesis -m "not endurance and not qgis" -n $(WORKERS) --dist loadfile --no-loadscope-reorder --durations 20 \
-		--ignore tests/app/test_openapi.py
+	$(PYTEST) -m "not thorough and $(APART)" -n $(WORKERS) --ignore tests/app/test_openapi.py
 
 # All operations have one name, of which files handed out as a whole run only the first.
 test-operations: $(READY)
@@ -40,7 +46,7 @@ test-operations: $(READY)
 
 # No database, no journeys, no Monte Carlo tests, nothing long, no endurance. It reports what it leaves out.
 test-fast: $(READY)
-	$(BIN)/python -m pytest --fast -n auto --dist loadfile --no-loadscope-reorder --durations 20
+	$(PYTEST) --fast -n auto
 
 # All operations with all callers, and all hostile values, filters, archives and images: some minutes.
 test-security: postgis

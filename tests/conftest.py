@@ -34,7 +34,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--fast",
         action="store_true",
-        help="leave out journeys, Monte Carlo tests, long tests, tests that need a database",
+        help="leave out journeys, Monte Carlo, long and thorough tests, tests that need a database",
     )
     parser.addoption(
         "--attacks",
@@ -92,6 +92,8 @@ def _slow_because(item: pytest.Item) -> str | None:
         return "tests that need a database"
     if item.get_closest_marker("endurance"):
         return "tests of endurance"
+    if item.get_closest_marker("thorough"):
+        return "thorough tests"
     if item.get_closest_marker("monte_carlo"):
         return "Monte Carlo tests"
     return "long tests" if item.get_closest_marker("long") else None

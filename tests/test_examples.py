@@ -14,7 +14,7 @@ from services.formats.block.reader import read_block
 from services.formats.sensor_models.rpc_files import read_rpc
 from tests.service_process import Service, until
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

@@ -104,6 +104,7 @@ def test_points_of_both_sides_are_made_and_spread_as_anywhere(made: Made) -> Non
     assert np.ptp(contents.document.metadata.extent[:, 0]) < 0.02
 
 
+@pytest.mark.thorough
 def test_a_footprint_finds_the_points_of_both_sides(made: Made, published: None, dsn: str) -> None:
     points = check_block(made.block).points
     scene = later_view().as_scene(SIGMA_M)
@@ -269,6 +270,7 @@ def test_what_lies_across_is_cut_and_nothing_of_it_is_lost(shape: str, expected:
     assert cut.length == pytest.approx(whole.length) or whole.area > 0.0
 
 
+@pytest.mark.thorough
 def test_a_scene_is_registered_on_points_of_the_store(
     made: Made, published: None, settings: Settings, storage: Storage, tmp_path: Path
 ) -> None:

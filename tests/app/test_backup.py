@@ -21,7 +21,7 @@ from tests.app.worker_processes import wait_until
 from tests.factories import make_block
 from tests.service_process import Service, until
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 ENDED = ("successful", "failed", "dismissed")
 SAME_HOST = {"Host": "localhost"}

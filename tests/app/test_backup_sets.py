@@ -34,6 +34,8 @@ from tests.app.conftest import EMPTY_TEMPLATE, fresh_database
 from tests.app.full_storage import Full, another, contents
 from tests.statements import run_sql
 
+pytestmark = pytest.mark.thorough
+
 KILLED_AT = """
 import os, sys
 from importlib import import_module

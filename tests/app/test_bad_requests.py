@@ -86,6 +86,7 @@ FUZZED = (
 )
 
 
+@pytest.mark.thorough
 @given(
     target=st.sampled_from(FUZZED),
     content=st.one_of(

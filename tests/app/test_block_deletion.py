@@ -180,6 +180,7 @@ def test_the_storage_of_another_installation_loses_nothing(
     assert installation.storage.keys("chips") == chips
 
 
+@pytest.mark.thorough
 def test_no_block_is_deleted_while_one_is_ingested(
     installation: Installation, withdrawn: MadeBlock, tmp_path: Path, dsn: str
 ):

@@ -255,6 +255,7 @@ def test_requirements_that_mean_nothing_are_refused(required: dict[str, float], 
         RequiredQuality(**required)  # type: ignore[arg-type]
 
 
+@pytest.mark.thorough
 def test_a_stored_block_is_assessed_by_a_job_on_files_of_the_server(
     world: QualityWorld,
     client: TestClient,

@@ -18,6 +18,8 @@ from tests.app.registration_outputs import A_TENTH_OF_A_PIXEL, largest_error_px
 from tests.app.s3_server import running_bucket
 from tests.app.worker_processes import ended, running_worker
 
+pytestmark = pytest.mark.thorough
+
 Bearer = Callable[[str], dict[str, str]]
 EXECUTE = "/processes/register-scene/execution"
 

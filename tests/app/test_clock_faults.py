@@ -22,6 +22,8 @@ from tests.app.worker_processes import ended, running_worker, scene_to_register,
 from tests.service_process import free_port
 from tests.statements import run_sql
 
+pytestmark = pytest.mark.thorough
+
 LEASE_S = 3.0
 PASSES = 40
 JUMPS_DAYS = (2.0, -3.0, 14_600.0, -1.0)

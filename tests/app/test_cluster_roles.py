@@ -128,7 +128,7 @@ def test_the_role_of_commands_owns_all_of_the_store(dsn: str):
     assert owners(dsn) == {(name, ROLE) for name in ("pg_class", "pg_proc", "pg_type")}
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 @pytest.mark.parametrize("state", ["running", "stopped"])
 def test_an_older_cluster_is_taken_over_once_and_serves_its_points(
     state: str, open_folder: Path, tmp_path: Path, dsn: str
@@ -171,7 +171,7 @@ def check_taken_over(cluster: Cluster, folder: Path, new: str) -> None:
         assert rows(cluster.dsn(DATABASE, SUPERUSER), WRITTEN) == written
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_a_takeover_is_whole_or_refused_and_a_server_of_a_former_amers_admits_the_role(
     open_folder: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -31,6 +31,8 @@ from tests.app.s3_server import running_bucket
 from tests.factories import BOX, make_block
 from tests.statements import run_sql
 
+pytestmark = pytest.mark.thorough
+
 Bearer = Callable[[str], dict[str, str]]
 CHIPS = "/collections/points/chips"
 EXPORT = {"inputs": {"bbox": list(BOX)}}

@@ -183,6 +183,7 @@ def test_a_lock_file_whose_process_is_another_one_by_now_does_not_stop_it(own):
             stranger.terminate()
 
 
+@pytest.mark.thorough
 def test_users_that_come_at_once_share_one_server(bare):
     with ThreadPoolExecutor(3) as pool:
         users = list(pool.map(User, [bare.folder] * 3))

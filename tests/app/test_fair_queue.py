@@ -301,6 +301,7 @@ class Crowd:
             attempts.succeed(connection, job.id, job.attempt, {})
 
 
+@pytest.mark.thorough
 def test_workers_at_once_do_every_job_once_within_the_limit_and_forget_none(database: Database):
     with database.transaction() as connection:
         for number in range(5):
@@ -349,6 +350,7 @@ def test_a_worker_killed_between_its_ticket_and_the_claim_leaves_the_job_to_othe
         assert claim(connection).id == waiting
 
 
+@pytest.mark.thorough
 def test_a_real_worker_does_the_job_of_another_owner_before_the_rest_of_a_flood(
     client: TestClient, settings: Settings, bearer, tmp_path: Path
 ):

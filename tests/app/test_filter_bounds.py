@@ -78,7 +78,7 @@ def test_a_filter_that_ends_its_parser_is_refused_and_the_next_one_answered() ->
     assert cql2_process.parse("text", "a = 1") == {"op": "=", "args": [{"property": "a"}, 1.0]}
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_a_filter_that_never_ends_is_refused_while_others_are_answered() -> None:
     refusals: list[str] = []
 
@@ -122,6 +122,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
+@pytest.mark.thorough
 def test_parsers_end_when_the_process_that_started_them_is_killed() -> None:
     run = subprocess.run([sys.executable, "-c", ORPHANS, ENDLESS], capture_output=True, text=True)
     assert run.returncode == -signal.SIGKILL, run.stderr

@@ -23,7 +23,7 @@ from tests.app.worker_processes import ended, running_worker
 from tests.factories import make_block
 from tests.statements import run_sql
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 MEBIBYTE = 1 << 20
 ROOM = 3 * MEBIBYTE

@@ -271,6 +271,7 @@ def test_the_health_of_points_and_views_is_read_with_them(
     assert lower == {*rows[disagreed].tolist(), int(read.views.start[30]) + 1}
 
 
+@pytest.mark.thorough
 def test_the_next_registration_prefers_points_that_have_served(
     world: FlatWorld,
     connection: Connection,

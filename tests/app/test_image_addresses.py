@@ -154,7 +154,7 @@ def test_what_is_no_image_in_a_bucket_is_refused_like_a_file(bucket) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.tif", "a.jp2", "a.ntf"])
-@pytest.mark.long
+@pytest.mark.thorough
 def test_an_image_that_vanishes_gives_an_error_and_no_pixels(bucket, image, tmp_path, name) -> None:
     driver = {"a.tif": "GTiff", "a.jp2": "JP2OpenJPEG", "a.ntf": "NITF"}[name]
     exact = {"QUALITY": "100", "REVERSIBLE": "YES"} if name == "a.jp2" else {}

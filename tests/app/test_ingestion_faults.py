@@ -25,7 +25,7 @@ from services.errors import FormatError
 from tests.factories import make_block
 from tests.statements import run_sql
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 TABLES = ("block", "image", "chip_file", "point", "view")
 PATIENCE_S = 30.0

@@ -45,7 +45,7 @@ from tests.app.test_vectors import drawn
 from tests.app.worker_processes import ended, running_worker
 from tests.statements import run_sql
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 UTM = "EPSG:32631"
 EXECUTION = "/processes/{}/execution"

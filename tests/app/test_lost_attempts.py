@@ -244,6 +244,7 @@ def test_a_worker_that_cannot_renew_its_lease_ends_the_process_of_its_attempt(
     assert endless.killed_after is not None
 
 
+@pytest.mark.thorough
 def test_a_worker_that_renews_its_lease_keeps_its_job_for_many_leases(
     database: Database, settings: Settings
 ):

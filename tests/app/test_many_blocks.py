@@ -29,6 +29,7 @@ def test_points_that_would_leave_the_earth_are_refused():
         lay_out(500_000_000)
 
 
+@pytest.mark.thorough
 def test_seventy_blocks_are_served_as_one_is(dsn, connection, storage, client, bearer, tmp_path):
     # The filling switches triggers off, which only a superuser may.
     ground = fill(make_conninfo(dsn, user=SUPERUSER), POINTS, block_points=BLOCK_POINTS)

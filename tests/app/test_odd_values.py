@@ -17,7 +17,7 @@ from tests.app.running_service import Served, service_with_a_block
 from tests.app.test_access_matrix import OPERATIONS
 from tests.factories import make_block
 
-pytestmark = [pytest.mark.long, pytest.mark.security]
+pytestmark = [pytest.mark.long, pytest.mark.security, pytest.mark.thorough]
 
 VALUES = {"bounded": 800, "full": 10_000}
 LONGEST_REPLY_S = 30.0

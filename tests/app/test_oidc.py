@@ -202,6 +202,7 @@ def test_a_key_without_a_use_verifies_signatures(client, issuer):
     assert client.get("/tokens/self", headers=issuer.token()).status_code == 200
 
 
+@pytest.mark.thorough
 def test_a_slow_issuer_delays_only_who_waits_for_its_answer(client, issuer, monkeypatch):
     assert client.get("/tokens/self", headers=issuer.token()).status_code == 200
     # The keys are old, and the issuer does not answer.

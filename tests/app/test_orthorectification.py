@@ -243,7 +243,7 @@ def test_a_map_finer_than_its_scene_is_refused_at_the_request_once_the_scene_is_
 
 
 @pytest.mark.real_data
-@pytest.mark.long
+@pytest.mark.thorough
 def test_two_views_of_one_place_lie_on_each_other_once_rectified(
     real_data: Path, tmp_path: Path
 ) -> None:

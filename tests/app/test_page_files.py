@@ -89,7 +89,7 @@ def test_the_lock_file_has_versions_and_no_addresses():
     assert [version for version in wanted.values() if not version[0].isdigit()] == []
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_the_types_of_the_page_are_those_of_the_api_and_the_report():
     script = ROOT / "scripts" / "make_api_types.py"
     check = subprocess.run(

@@ -27,7 +27,7 @@ from tests.services.production.simulated_control import CHI2_3
 from tests.services.simulated import BLOCK_SIGMA_M, OPTIONS, block_views, world
 from tests.services.ties import difference_m
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 STATED = PointStatements(StatedByCaller("ellipsoid"), (0.1, 0.2), (0.1, 0.2), 0.2)
 

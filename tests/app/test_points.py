@@ -165,6 +165,7 @@ def test_a_page_token_of_another_query_is_refused(made, get):
         assert "does not belong to this query" in reply.json()["detail"]
 
 
+@pytest.mark.thorough
 def test_the_number_of_points_is_exact_to_ten_thousand_and_estimated_beyond(
     connection, storage, tmp_path
 ):

@@ -31,6 +31,8 @@ from tests.services.chip_bases import (
 )
 from tests.services.textures import as_pixels
 
+pytestmark = pytest.mark.thorough
+
 NEXT_ZONE = "EPSG:32632"
 POINT_SIGMA_M, FRAME_SIGMA_M = 2.0, 1.5
 SCENE_M = 5600.0

@@ -28,7 +28,7 @@ from services.production.from_images import Production
 from tests.service_process import free_port
 from tests.services.simulated import BLOCK_SIGMA_M, OPTIONS, block_views, world
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 SECONDS_TO_START = 60.0
 

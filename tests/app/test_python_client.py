@@ -88,6 +88,7 @@ def test_blocks_have_their_extent(service: Client):
     assert block["properties"]["state"] == "published"
 
 
+@pytest.mark.thorough
 def test_a_scene_is_uploaded_registered_and_its_results_downloaded(
     service: Client, installation: Installation, tmp_path: Path
 ):

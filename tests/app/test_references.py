@@ -42,6 +42,8 @@ from tests.app.s3_server import running_bucket
 from tests.app.worker_processes import ended, running_worker
 from tests.statements import run_sql
 
+pytestmark = pytest.mark.thorough
+
 SHIFT_PX = np.array([5.3, -3.6])
 A_TENTH_OF_A_PIXEL = 0.1
 SIZE = 420

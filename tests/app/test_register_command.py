@@ -33,7 +33,7 @@ from tests.app.running_service import running_service
 from tests.command_line import Done, amers_here, amers_process
 from tests.statements import run_sql
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 Amers = Callable[..., Done]
 

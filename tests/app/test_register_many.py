@@ -99,6 +99,7 @@ def test_scenes_are_registered_together_and_the_wrong_one_is_named(
     assert (output / "block" / "images.npz").exists()
 
 
+@pytest.mark.thorough
 def test_a_scene_joins_later_and_the_earlier_files_stay(
     world: FlatWorld, folder: Path, three: tuple[Done, Path], tmp_path: Path
 ):
@@ -121,6 +122,7 @@ def test_a_scene_joins_later_and_the_earlier_files_stay(
     assert (np.abs(moved_px) < 2.0 * np.array(joined["std_px"])).all()
 
 
+@pytest.mark.thorough
 def test_registrations_on_the_store_are_recorded(
     amers: Amers, world: FlatWorld, folder: Path, tmp_path: Path, dsn: str, storage: Storage
 ):

@@ -37,7 +37,7 @@ from tests.app.worker_processes import ended, running_worker
 from tests.command_line import Done, amers_here
 from tests.services.formats.sensor_models.simulated_metadata import dimap_v2
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 SHAPE, SIZE = (2400, 3000), 800
 FIRST = (900.0, 1300.0)

@@ -37,6 +37,8 @@ from tests.app.registration_outputs import (
 from tests.app.worker_processes import ended, running_worker
 from tests.statements import run_sql
 
+pytestmark = pytest.mark.thorough
+
 Bearer = Callable[[str], dict[str, str]]
 
 

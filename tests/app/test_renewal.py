@@ -46,6 +46,8 @@ from tests.app.renewal_world import POINTS, Years, make_years, write_scene
 from tests.factories import make_block
 from tests.statements import run_sql
 
+pytestmark = pytest.mark.thorough
+
 ALL_POINTS = RegistrationOptions(max_points=0)
 DAYS = ("2024-04-10", "2024-07-20", "2024-10-15", "2025-01-15")
 """One in each quarter; the last one is in winter."""

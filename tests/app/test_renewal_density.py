@@ -26,7 +26,7 @@ from tests.app.ledger import job_runner
 from tests.factories import metadata
 from tests.services.block_with_hole import HOLE_M, PER_KM2, SIGMA_M, older, simulated
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 VIEWS = 2
 

@@ -35,6 +35,8 @@ from tests.app.flat_world import (
 from tests.app.ledger import job_runner, make_token
 from tests.app.test_orthorectification import MODEL, write_inputs
 
+pytestmark = pytest.mark.thorough
+
 MERCATOR_M = 40_075_016.68557849
 """Width of the map of the web."""
 a_quarter_of_a_pixel_m = 0.11

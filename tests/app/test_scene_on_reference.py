@@ -13,6 +13,8 @@ from rasterio.transform import Affine
 from app.cli.main import main
 from services.imagery.source import ArrayImage, sample_image
 
+pytestmark = pytest.mark.thorough
+
 SHIFT_PX = np.array([5.3, -3.6])
 SHIFT_ALLOWED_PX = 0.1
 SIZE = 420

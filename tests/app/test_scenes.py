@@ -266,6 +266,7 @@ def test_an_upload_survives_no_failure_of_the_database(settings: Settings, beare
         assert client.get("/scenes", headers=me).json() == {"scenes": []}
 
 
+@pytest.mark.thorough
 def test_an_upload_cut_off_by_its_sender_leaves_nothing(
     token: Callable[[str], str], settings: Settings, storage: Storage, tmp_path: Path, dsn: str
 ):

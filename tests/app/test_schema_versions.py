@@ -49,7 +49,7 @@ def test_an_older_schema_is_to_be_upgraded(settings: Settings, dsn: str):
         pass
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 @pytest.mark.parametrize("command", [("serve", "--no-worker"), ("worker",)])
 def test_the_commands_end_with_the_reason(dsn: str, tmp_path: Path, command: tuple[str, ...]):
     set_revision(dsn, "9999")

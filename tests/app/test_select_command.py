@@ -93,7 +93,7 @@ def test_a_selection_is_written_with_cells_tables_and_report(select, catalogue, 
     assert short == pytest.approx((missing > 0).mean(), abs=0.01)
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_the_written_selection_is_a_catalogue_again(select, catalogue, area, tmp_path):
     """With its masks: hardly an image of a selection is unnecessary, and no more ground is short."""
     select(catalogue, "-o", tmp_path / "one", "--area", area)
@@ -167,7 +167,7 @@ def test_what_cannot_be_done_is_refused_and_nothing_written(select, catalogue, t
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_an_older_selection_is_replaced_as_a_whole_and_kept_when_the_new_one_fails(
     select, catalogue, area, tmp_path
 ):

@@ -22,7 +22,7 @@ from app.usecases.tokens import create_token
 from tests.factories import make_block
 from tests.service_process import Service, until, users_of
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 POINTS = 2100
 """More features than are built as one text, so that they are streamed."""

@@ -239,6 +239,7 @@ def file_path(served) -> str:
     return f"/scenes/{document['id']}/files/a.tif"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["stream", "file"])
 def test_twelve_readers_who_take_nothing_are_given_up(served, unharmed, file_path, kind) -> None:
     path = file_path if kind == "file" else f"/collections/points/items?limit={POINTS}"
@@ -255,6 +256,7 @@ def test_twelve_readers_who_take_nothing_are_given_up(served, unharmed, file_pat
             assert received.count(b"HTTP/1.1 200") < REPLIES
 
 
+@pytest.mark.thorough
 def test_sixteen_heavy_filters_of_one_caller_leave_connections_to_others(served, unharmed) -> None:
     angle = np.linspace(0.0, 2.0 * math.pi, 3_000)
     angle[-1] = 0.0

@@ -17,7 +17,7 @@ from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_wo
 from tests.app.worker_processes import ended, running_worker
 from tests.command_line import amers_here
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 RELATIVE = "Relative to the control points"
 ON_THE_EARTH = "On the Earth"

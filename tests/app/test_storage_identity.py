@@ -113,6 +113,7 @@ def test_a_database_of_another_installation_removes_nothing(
         assert_untouched(full, other, "that of another installation", monkeypatch, caplog)
 
 
+@pytest.mark.thorough
 def test_an_older_backup_of_the_database_removes_nothing(
     full: Full,
     cluster: Cluster,
@@ -126,6 +127,7 @@ def test_an_older_backup_of_the_database_removes_nothing(
         assert_untouched(full, backup, "the database is older than the storage", monkeypatch, caplog)
 
 
+@pytest.mark.thorough
 def test_a_service_on_an_empty_database_beside_a_full_storage_says_so_and_removes_nothing(
     full: Full, cluster: Cluster, tmp_path: Path
 ):
@@ -191,6 +193,7 @@ def test_an_adopted_storage_is_swept_by_its_new_database_and_not_by_the_former_o
     assert contents(storage) == before, "but for the upload that was arriving"
 
 
+@pytest.mark.thorough
 def test_what_the_sweep_removes_lies_in_the_trash_for_days_of_calendar_and_uptime(full: Full):
     storage, key = open_storage(full.settings), f"scenes/{uuid4()}/left.tif"
     storage.put(key, [b"left by a killed process"])
@@ -213,6 +216,7 @@ def test_what_the_sweep_removes_lies_in_the_trash_for_days_of_calendar_and_uptim
         assert bool(storage.keys(TRASH)) == is_left, later
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["folder"])
 def test_many_unknown_files_at_once_stay_until_an_operator_lets_them_go(
     full: Full, caplog: pytest.LogCaptureFixture
@@ -230,6 +234,7 @@ def test_many_unknown_files_at_once_stay_until_an_operator_lets_them_go(
     assert len(storage.keys(TRASH)) == len(stray)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["folder"])
 def test_nothing_is_swept_at_the_first_ticks_of_a_worker(full: Full):
     storage, stop = open_storage(full.settings), threading.Event()

@@ -100,6 +100,7 @@ def used_bytes(client: TestClient, me: dict[str, str], dsn: str) -> int:
         return usage.read_usage(connection, owner).total_bytes
 
 
+@pytest.mark.thorough
 @in_both
 def test_a_token_with_a_quota_of_one_byte_leaves_nothing_by_any_way(
     client: TestClient,
@@ -276,6 +277,7 @@ def test_results_of_jobs_at_the_same_time_cannot_exceed_the_quota_together(
     assert sorted(outcomes) == ["refused", "reserved"]
 
 
+@pytest.mark.thorough
 @in_both
 def test_an_owner_removes_the_results_of_a_job_and_the_history_stays(
     client: TestClient,
@@ -326,6 +328,7 @@ def test_an_attempt_that_is_lost_gives_its_room_back(
         assert usage.read_usage(connection, me.id).result_bytes == bytes_in_storage(storage) == 100
 
 
+@pytest.mark.thorough
 @in_both
 def test_the_ledger_equals_the_storage_after_a_mixed_run(
     client: TestClient,

@@ -98,6 +98,7 @@ def test_an_upload_outlives_a_clock_that_jumps(
     assert storage.path(f"scenes/{last.headers['amers-scene']}/a.tif").read_bytes() == TIFF
 
 
+@pytest.mark.thorough
 def test_an_abandoned_upload_is_deleted_after_a_day_of_running_time(
     client: TestClient, me: dict[str, str], database: Database, storage: Storage
 ):

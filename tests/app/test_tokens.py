@@ -249,6 +249,7 @@ def test_a_request_without_a_token_is_refused(connection):
     assert not refused.value.authenticated
 
 
+@pytest.mark.thorough
 def test_the_command_line_makes_lists_and_revokes(dsn):
     made = amers(dsn, "token", "create", "survey office", "--scope", "read", "--days", "7", "--json")
     assert made.returncode == 0, made.stderr

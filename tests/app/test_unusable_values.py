@@ -88,6 +88,7 @@ def document(base: dict[str, Any], path: tuple[str, ...], value: str) -> str:
     return json.dumps({**base, path[0]: inner}).replace(json.dumps(marker), value)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("process_id", PROCESSES)
 def test_no_input_of_a_process_accepts_what_json_cannot_carry(
     client: TestClient, admin: dict[str, str], inputs: dict[str, dict[str, Any]], process_id: str
@@ -116,6 +117,7 @@ def test_an_option_without_a_finite_value_is_named(
     assert "inputs.map.gsd_m: a finite number expected" in reply.json()["detail"]
 
 
+@pytest.mark.thorough
 def test_every_body_of_the_api_is_free_of_what_json_cannot_carry(
     client: TestClient, admin: dict[str, str]
 ):
@@ -136,6 +138,7 @@ def test_every_body_of_the_api_is_free_of_what_json_cannot_carry(
     assert number > 50
 
 
+@pytest.mark.thorough
 def test_no_parameter_of_the_api_accepts_numbers_that_are_none(
     client: TestClient, admin: dict[str, str]
 ):

@@ -24,6 +24,8 @@ from tests.app.worker_processes import wait_until
 from tests.service_process import free_port
 from tests.statements import run_sql
 
+pytestmark = pytest.mark.thorough
+
 TIFF = b"II*\0" + bytes(range(256)) * 40
 MODEL = b"LINE_OFF: 1"
 TUS = {"Tus-Resumable": "1.0.0"}

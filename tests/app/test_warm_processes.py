@@ -14,7 +14,7 @@ import pytest
 from app.worker.warm_process import WarmProcess, WarmServer
 from tests.app.worker_processes import alive, kill, wait_until
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 PATIENCE_S = 120.0
 FUNCTIONS = "tests.app.warm_functions"

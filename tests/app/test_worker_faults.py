@@ -30,7 +30,7 @@ from tests.app.worker_processes import (
 )
 from tests.statements import run_sql
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 LEASE_S = 2.0
 PASSES = 100

@@ -15,7 +15,7 @@ from tests.journeys.map_page import ARTEFACTS, PHONE, WIDE, assert_readable, tab
 from tests.service_process import Service
 from tests.statements import run_sql
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 PARTS = {
     "status": "Queue and storage",

@@ -18,7 +18,7 @@ from services.formats.sensor_models.rpc_text import format_rpc_text, parse_rpc_t
 from tests.app.flat_world import FlatWorld, make_flat_world
 from tests.service_process import Service
 
-pytestmark = [pytest.mark.long, pytest.mark.security]
+pytestmark = [pytest.mark.long, pytest.mark.security, pytest.mark.thorough]
 
 patience_s = 120.0
 degrees_away = 3.0

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytestmark = [pytest.mark.long, pytest.mark.real_data]
+pytestmark = [pytest.mark.long, pytest.mark.real_data, pytest.mark.thorough]
 
 SHIFT_M = np.array([6.4, 18.3])
 """East and north shift of the May scene against the June scene, from SIFT features over both."""

@@ -20,7 +20,7 @@ from services.registration.on_points import register_scene
 from services.sensors.base import SensorModel
 from services.types import Array, FloatImage
 
-pytestmark = pytest.mark.real_data
+pytestmark = [pytest.mark.real_data, pytest.mark.thorough]
 
 RATIO = 4
 SPOILED_PX = np.array([6.0, -9.0])

@@ -19,7 +19,7 @@ from services.registration.on_reference import register_on_reference
 from services.types import ControlPoints
 from tests.services.simulated import MemoryChips
 
-pytestmark = [pytest.mark.long, pytest.mark.real_data]
+pytestmark = [pytest.mark.long, pytest.mark.real_data, pytest.mark.thorough]
 
 five_percent = 0.05
 the_same_point_m = 1.0

@@ -19,7 +19,7 @@ from tests.command_line import Done, amers_here, amers_process
 from tests.documents import blocks_of
 from tests.service_process import Service, until
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 README = Path(__file__).parents[2] / "README.md"
 GUIDE = README.parent / "docs" / "guide.md"

@@ -14,7 +14,7 @@ from tests.journeys.guide_files import write_bases, write_geoids, write_guide_fi
 from tests.journeys.map_page import assert_readable
 from tests.service_process import installed_at
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 NOT_RUN = {
     "production run --selection my-selection --spacing-m 1400 -o my-block": "needs six images of "

@@ -10,7 +10,7 @@ import rasterio
 
 from tests.command_line import amers_here
 
-pytestmark = [pytest.mark.long, pytest.mark.real_data]
+pytestmark = [pytest.mark.long, pytest.mark.real_data, pytest.mark.thorough]
 
 SPACING_M = 30.0
 BIAS_PX = 1.2

@@ -20,7 +20,7 @@ from tests.factories import make_block
 from tests.journeys.map_page import ARTEFACTS, PHONE, WIDE, assert_readable, tab_to, until_drawn
 from tests.service_process import Service, until
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 points_of_the_block = 40
 enough_px = 50

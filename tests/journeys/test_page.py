@@ -31,7 +31,7 @@ from tests.journeys.map_page import (
 )
 from tests.service_process import Service, until
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 chip_px = 101
 piece_bytes = 8 * 1024 * 1024

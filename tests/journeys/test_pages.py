@@ -13,7 +13,7 @@ from tests.journeys.conftest import Amers
 from tests.journeys.map_page import assert_readable
 from tests.service_process import Service, installed_at
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 PAGES = {
     "landing": "/",

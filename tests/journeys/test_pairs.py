@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = [pytest.mark.long, pytest.mark.real_data]
+pytestmark = [pytest.mark.long, pytest.mark.real_data, pytest.mark.thorough]
 
 a_tenth_of_a_pixel = 0.1
 what_features_allow_px = 0.11

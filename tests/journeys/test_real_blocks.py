@@ -18,7 +18,7 @@ from app.usecases.blocks.quality import (
 from app.usecases.production import BlockIdentity, OrthoFiles, run_ortho_production
 from app.usecases.terrain_file import TerrainFile
 
-pytestmark = [pytest.mark.long, pytest.mark.real_data]
+pytestmark = [pytest.mark.long, pytest.mark.real_data, pytest.mark.thorough]
 
 MAY_AGAINST_JUNE_M = np.array([6.4, 18.3])
 """East and north shift of the May scene against the June scene, from SIFT features over both."""

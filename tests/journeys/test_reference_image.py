@@ -15,7 +15,7 @@ from services.registration.on_reference import register_on_reference
 from services.sensors.ortho import OrthoModel
 from services.types import Acquisition, Array, FloatImage
 
-pytestmark = pytest.mark.real_data
+pytestmark = [pytest.mark.real_data, pytest.mark.thorough]
 
 SHIFT_EAST_M, SHIFT_NORTH_M = 6.4, 18.3
 """Shift of the May scene against the June scene, from SIFT features over both."""

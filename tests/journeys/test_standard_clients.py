@@ -18,7 +18,7 @@ from app.usecases.registration.deliverables import OUTPUTS
 from tests.app.flat_world import CENTRE, SIGMA_M, FlatWorld, make_flat_world
 from tests.service_process import Service, until
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 a_hundredth_of_a_degree = 0.01
 SCENES = 3

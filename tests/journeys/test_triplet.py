@@ -21,7 +21,7 @@ from services.sensors.rpc import RpcModel
 from tests.journeys.ties import independent_tracks
 from tests.services.simulated import MemoryChips
 
-pytestmark = [pytest.mark.long, pytest.mark.real_data]
+pytestmark = [pytest.mark.long, pytest.mark.real_data, pytest.mark.thorough]
 
 names = ("img_01", "img_02", "img_03")
 injected_shift_px = np.array([400.0, -900.0])

@@ -15,7 +15,7 @@ from services.sensors.correction import CorrectedModel, no_correction
 from tests.journeys.ties import independent_tracks
 from tests.services.simulated import MemoryChips
 
-pytestmark = [pytest.mark.endurance, pytest.mark.real_data]
+pytestmark = [pytest.mark.endurance, pytest.mark.real_data, pytest.mark.thorough]
 
 NAMES = ("img_01", "img_02", "img_03")
 INJECTED_PX = ((30.0, -20.0, 1.0), (-25.0, 40.0, -1.0), (45.0, 35.0, 0.7))

@@ -122,6 +122,7 @@ def test_moved_ground_is_as_large_and_as_far_as_drawn() -> None:
         assert np.hypot(*made.moved.shift_px) * 0.5 == pytest.approx(distortion.moved_m)
 
 
+@pytest.mark.thorough
 def test_the_truth_of_a_distorted_scene_is_that_of_its_pixels(block: Block) -> None:
     """What the undistorted scene shows at the undistorted place."""
     straight, bent = (prepared_with(block, d) for d in (Drawn(), Drawn("bow", 6.0)))
@@ -148,6 +149,7 @@ def test_the_model_of_another_view_is_right_about_the_middle_only(block: Block) 
     assert lean == pytest.approx(np.tan(np.radians(10.0)), rel=0.1)
 
 
+@pytest.mark.thorough
 def test_a_scene_without_distortion_is_right_and_a_mirrored_one_refused(block: Block) -> None:
     trial = replace(distorted_trial("jitter", SEED, 1, (SMALL,)), point_ce90_m=1.0)
     clean = attempt(SMALL, replace(trial, distortion=Drawn()), block, SEED, OPTIONS)

@@ -88,6 +88,7 @@ def registration_of(trial: Trial, block: Block) -> Registration:
     )
 
 
+@pytest.mark.thorough
 def test_no_delivered_scene_has_a_larger_error_than_stated(hard: list, clear: list) -> None:
     assert not [trial.number for trial, outcome in hard + clear if outcome.delivered and outcome.wrong]
 
@@ -108,6 +109,7 @@ def test_errors_agree_with_the_stated_accuracy(hard: list, clear: list) -> None:
     assert low < np.mean(squares) < high
 
 
+@pytest.mark.thorough
 def test_nominal_conditions_give_a_model_five_times_better_than_its_points(block: Block) -> None:
     trial = nominal_trial(SEED, 0, NOMINAL)
     outcome = attempt(NOMINAL, trial, block, SEED, RegistrationOptions())
@@ -117,6 +119,7 @@ def test_nominal_conditions_give_a_model_five_times_better_than_its_points(block
     assert outcome.displacement_m < what_srp_publishes_for_corners_m
 
 
+@pytest.mark.thorough
 def test_inverted_contrast_is_found_by_its_gradient_and_reported(
     block: Block, as_it_was: Measures
 ) -> None:
@@ -126,6 +129,7 @@ def test_inverted_contrast_is_found_by_its_gradient_and_reported(
     assert as_it_was.by_gradient[as_it_was.active].mean() < 0.1
 
 
+@pytest.mark.thorough
 def test_points_hidden_by_clouds_are_reported_as_cloudy(block: Block, as_it_was: Measures) -> None:
     below = registration_of(clear_trial(1, cloud_cover=0.4), block).measures
     hidden = as_it_was.matched & ~below.matched
@@ -251,6 +255,7 @@ def test_correlated_errors_are_alike_near_and_independent_far_and_of_the_declare
     assert abs(np.mean(far)) < 0.15 * declared_m2
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("draw", [damaged_trial, points_trial, sensor_trial])
 def test_a_clear_scene_of_each_family_is_delivered_and_right(block: Block, draw) -> None:
     trial = replace(draw(SEED, 1, (SMALL,)), **{**CLEAR, "drift_px": 0.2})

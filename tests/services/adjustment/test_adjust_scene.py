@@ -71,6 +71,7 @@ def normalised_square(result: SceneAdjustment, truth: Array) -> float:
     return float(error @ np.linalg.solve(result.covariance[np.ix_(free, free)], error) / len(free))
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 @pytest.mark.parametrize("order", ["shift", "drift", "affine"])
 def test_a_correction_is_recovered_within_its_stated_covariance(order: Order) -> None:
@@ -92,6 +93,7 @@ def test_without_noise_the_correction_is_exact() -> None:
         assert result.active.all()
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 @pytest.mark.parametrize("order", ["shift", "drift", "affine"])
 def test_the_order_is_that_of_the_truth_and_its_covariance_is_honest(order: Order) -> None:
@@ -181,6 +183,7 @@ def test_measures_without_a_position_and_those_held_out_are_not_used() -> None:
     np.testing.assert_allclose(result.correction.parameters[:, 0], [12.0, -7.0], atol=3.0 * NOISE_PX)
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 def test_sigmas_that_were_too_small_are_made_good() -> None:
     rng = np.random.default_rng(8)
@@ -216,6 +219,7 @@ def test_honest_sigmas_have_unit_weight_whatever_the_tolerance(tolerance: float)
     assert result.sigma0 == pytest.approx(1.0, rel=0.06)
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 def test_imprecise_points_weigh_little() -> None:
     rng = np.random.default_rng(10)
@@ -309,6 +313,7 @@ def test_what_could_not_be_tested_stays_uncertain():
     assert std[0].max() < 0.5 * std[1].min()
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 def test_a_drift_too_small_to_be_seen_is_in_the_stated_accuracy():
     """Points of several pixels hide a drift of 1 px; the stated covariance includes it all the same."""
@@ -364,6 +369,7 @@ def displaced(
     return out
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 @pytest.mark.parametrize(("of_points_px", "least"), [(0.0, 0.7), (2.0, 0.0)])
 def test_what_parts_of_the_image_are_off_by_is_in_the_accuracy_of_every_place(

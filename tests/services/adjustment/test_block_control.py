@@ -115,7 +115,7 @@ def of_one_image(observations: Observations, known: int) -> Observations:
     return observations.take(is_first | (observations.point >= known))
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_known_points_that_one_image_shows_place_the_block_as_well() -> None:
     normalised = []
     for trial in range(trials):

@@ -9,6 +9,8 @@ from benchmarks.block_coverage import Case, draw, measure
 from services.adjustment.bundle import adjust_block
 from services.errors import DisconnectedBlock
 
+pytestmark = pytest.mark.thorough
+
 TRIALS = 20
 lowest, highest = 0.85, 0.97
 by_chance = 1.65

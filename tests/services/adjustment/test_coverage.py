@@ -4,7 +4,7 @@ import pytest
 
 from benchmarks.coverage import LOWEST, Case, measure
 
-pytestmark = pytest.mark.monte_carlo
+pytestmark = [pytest.mark.monte_carlo, pytest.mark.thorough]
 
 TRIALS = 40
 

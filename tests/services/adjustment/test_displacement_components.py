@@ -147,6 +147,7 @@ MOTIONS = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 @pytest.mark.parametrize("name", list(MOTIONS))
 def test_what_points_show_along_lines_and_samples_is_followed_with_the_stated_accuracy(
@@ -175,6 +176,7 @@ def test_an_affine_correction_alone_would_be_wrong_and_say_nothing(name: str) ->
     assert off_px > WRONG * float(np.median(stated))
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 def test_scenes_that_do_not_move_are_not_accused_and_not_bent() -> None:
     trials = [trial(still, seed, count=60) for seed in range(150)]
@@ -183,6 +185,7 @@ def test_scenes_that_do_not_move_are_not_accused_and_not_bent() -> None:
     assert 0.7 < np.mean([one.normalised for one in trials]) < 1.3
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 def test_the_chance_of_each_family_is_what_it_says() -> None:
     """Of independent errors, at most 5 % have a chance below 5 %, and not far fewer."""

@@ -9,6 +9,8 @@ from services.errors import NoConsensus
 from services.geodesy import move_metres
 from services.types import Array, Frame
 
+pytestmark = pytest.mark.thorough
+
 BEFORE = Frame(np.diag([5.0, 4.0, 8.0]) ** 2)
 SOURCE = Frame.from_sigmas(0.3, 0.5)
 KNOWN_M = np.array([0.2, 0.2, 0.4])

@@ -20,6 +20,8 @@ from services.types import Array, Frame, IntArray, Observations
 from tests.services.conftest import SHAPE, FlatModel
 from tests.services.ties import difference_m
 
+pytestmark = pytest.mark.thorough
+
 TRIALS = 10
 POINT_SIGMA_M, FRAME_SIGMA_M = 0.3, 0.8
 SEAMS = {"star": ([0, 1, 2, 3, 4], [0, 3, 4, 5, 6]), "strip": ([*range(9)], [*range(6, 16)])}

@@ -20,6 +20,8 @@ from tests.services.adjustment.test_displacement_components import (
 )
 from tests.services.conftest import FlatModel
 
+pytestmark = pytest.mark.thorough
+
 SIGMA_PX = 0.5
 
 

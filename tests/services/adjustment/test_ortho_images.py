@@ -32,6 +32,7 @@ def squares(block: BlockAdjustment, one: Draw, coordinates: slice) -> tuple[Arra
     return rows, (error_m * whitened).mean(axis=1)
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 @pytest.mark.parametrize("hybrid", [False, True])
 def test_one_site_carries_over_the_archipelago_as_declared(hybrid: bool) -> None:

@@ -127,7 +127,7 @@ def test_the_frame_of_another_pair_follows_its_control(triplet: Triplet, base: B
     assert chi2.ppf(0.001, 3 * trials) < np.sum(squares) < chi2.ppf(0.999, 3 * trials)
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_wrong_points_among_real_control_leave_by_name(triplet: Triplet, base: BlockAdjustment) -> None:
     images, observations = triplet.pair(1, 2)
     for trial in range(trials):

@@ -12,7 +12,7 @@ from services.adjustment.parameters import image_parameters
 from services.formats.sensor_models.rpc_text import parse_rpc_text
 from services.types import Array, Observations
 
-pytestmark = pytest.mark.real_data
+pytestmark = [pytest.mark.real_data, pytest.mark.thorough]
 
 location_sigma_px = 20.0
 slope = 1e-4

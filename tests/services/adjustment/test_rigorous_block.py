@@ -109,6 +109,7 @@ def held_by_regions(block: BlockAdjustment, truth: Array) -> float:
     return float(((off_m * whitened).sum(axis=1) < ninety_percent).mean())
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 def test_a_tenth_of_wrong_observations_leaves_the_regions_as_good() -> None:
     images, held = mixed(), []

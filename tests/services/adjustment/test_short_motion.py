@@ -91,6 +91,7 @@ def test_several_swings_add_up() -> None:
     assert variance == pytest.approx([(1.0 + 0.64) / 2.0, (2.25 + 0.64) / 2.0], rel=0.2)
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 def test_scenes_that_do_not_move_are_not_accused() -> None:
     """400 scenes, of which chance may accuse one in ten thousand; slopes of the ground move none."""

@@ -53,6 +53,7 @@ def test_every_image_more_improves_the_planimetry() -> None:
     assert on_six_points(ALL).rms_m[2] < on_six_points(PAIR).rms_m[2]
 
 
+@pytest.mark.thorough
 def test_heights_are_as_good_as_the_base_is_long() -> None:
     up_m = [with_points(6, members, marks_m, TRIALS).rms_m[2] for members in PAIRS]
     assert up_m[0] > 1.2 * up_m[1] > 1.2 * 1.2 * up_m[2]
@@ -60,12 +61,14 @@ def test_heights_are_as_good_as_the_base_is_long() -> None:
         assert ours < PUBLISHED_UP[members]
 
 
+@pytest.mark.thorough
 def test_points_in_the_middle_leave_the_rest_to_extrapolation() -> None:
     whole, middle = extrapolated(0.5, marks_m, TRIALS)
     worse = np.linalg.norm(middle.rms_m) / np.linalg.norm(whole.rms_m)
     assert 1.05 < worse < 1.4
 
 
+@pytest.mark.thorough
 def test_the_orbit_holds_a_pair_on_poor_points() -> None:
     held, free = (with_poor_points(factor, marks_m, TRIALS) for factor in (1.0, 10.0))
     assert max(held.rms_m) < 10.0

@@ -130,7 +130,7 @@ class Watched(ArrayImage):
         return super().read(window)
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_of_a_wide_image_strips_are_read_piece_by_piece() -> None:
     lines = 2500
     image = Watched(broken(ground(7, (lines + 30, 6000)), 1800, 30))

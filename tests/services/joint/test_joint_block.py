@@ -140,6 +140,7 @@ def test_a_single_scene_is_adjusted_as_it_is_alone() -> None:
         assert 0.6 < np.median(stated / sigma_px) < 1.5
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 @pytest.mark.parametrize("swing_px", [(5.0, 3.0), (0.0, 6.0)])
 def test_a_scene_that_swings_is_followed_with_the_stated_accuracy(swing_px: tuple[float, float]) -> None:
@@ -219,6 +220,7 @@ def test_every_scene_is_qualified_with_the_stability_of_the_block() -> None:
     assert held_cells(measures)
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 def test_a_scene_that_joins_agrees_with_one_adjustment_of_all_scenes() -> None:
     squares, accurate = [], []
@@ -243,7 +245,7 @@ def test_a_scene_that_joins_agrees_with_one_adjustment_of_all_scenes() -> None:
     assert 0.1 < np.mean(accurate) < 2.5
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_a_scene_that_joins_a_swinging_one_is_tied_to_what_that_scene_truly_shows() -> None:
     squares = []
     for trial in range(3):

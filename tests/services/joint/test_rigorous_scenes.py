@@ -37,6 +37,8 @@ from services.sensors.rpc_fit import fit_rpc
 from services.simulation.world import World, make_world
 from services.types import Array, Frame, Observations
 
+pytestmark = pytest.mark.thorough
+
 OPTIONS = RegistrationOptions()
 SHAPE, GSD_M = (16000, 16000), 1.5
 EXTENT_M = np.array([-14000.0, 14000.0, -14000.0, 14000.0])

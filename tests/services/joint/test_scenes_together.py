@@ -17,7 +17,7 @@ from services.types import Array
 from tests.services.registration.test_on_points import SIGMA_M, frame_m, per_degree
 from tests.services.simulated import block, plan, spoiled_view, world
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 NAMES = ("first", "second", "hazy", "elsewhere")
 

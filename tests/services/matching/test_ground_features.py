@@ -101,7 +101,7 @@ def test_views_of_other_orbits_and_pixel_sizes_share_details() -> None:
     assert np.mean(np.abs(error_px) < a_pixel) > 0.9
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_memory_is_that_of_a_part_and_parts_leave_no_gap() -> None:
     """Parts of a third of the image find as many features everywhere as one part that holds it all."""
     scene = block_views()[0].as_scene(BLOCK_SIGMA_M)

@@ -95,7 +95,7 @@ def half_for_endurance() -> list[object]:
     ]
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 @pytest.mark.parametrize(("kind", "where", "smoothness_px", "white"), half_for_endurance())
 def test_the_stated_sigma_is_honest_whatever_is_missing(
     kind: Kind, where: Where, smoothness_px: float, white: bool
@@ -126,7 +126,7 @@ def test_less_than_one_percent_missing_costs_nothing(kind: Kind, where: Where) -
     np.testing.assert_allclose(np.median(damaged.sigma_px), np.median(whole.sigma_px), rtol=0.05)
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_the_stated_sigma_grows_with_what_is_missing() -> None:
     sigma = [
         float(np.median(trials("patches", "patch", share, 1.5, white=True).sigma_px))

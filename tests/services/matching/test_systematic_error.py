@@ -13,6 +13,8 @@ from services.matching.systematic_error import (
 )
 from services.types import Acquisition, Array, BoolArray, Views
 
+pytestmark = pytest.mark.thorough
+
 NORTH, EAST, SOUTH = 0.0, 90.0, 180.0
 NINETY_PERCENT = 2.0 * np.log(10.0)
 """Square of the radius of the 90 % region of the plane, in units of sigma."""

@@ -271,7 +271,7 @@ def test_voids_of_image_and_terrain_are_nodata() -> None:
     assert 1800 < lost.sum() < 4500
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_occluded_ground_is_ground_that_no_line_of_sight_meets_first() -> None:
     ground = terrain(300.0)
     grid = choose_grid(scene(), ground)

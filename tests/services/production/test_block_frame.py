@@ -18,6 +18,8 @@ from services.types import Acquisition, Array, Observations
 from tests.services.simulated import GSD_M, ring_of_geometries, world
 from tests.services.ties import difference_m
 
+pytestmark = pytest.mark.thorough
+
 SIGMA_M = 3.0
 SHAPE = (4000, 4000)
 ring_m = (1.34, 1.34, 5.01)

@@ -15,7 +15,7 @@ from services.types import Array, ControlPoints, Frame
 from tests.services.production.simulated_control import frame_error_m, free, placed, views
 from tests.services.simulated import OPTIONS, MemoryChips
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 NEW = 12
 """Seed of the images that are made into a block."""

@@ -69,6 +69,7 @@ def own(names: Array, chips: list[Scene | str]) -> OwnChips:
     return OwnChips(names, image_of, (Acquisition("chip"),), chips.__getitem__)
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 @pytest.mark.parametrize(
     ("chip_m", "side", "scene_m", "smooth_m"),

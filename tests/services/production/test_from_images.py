@@ -106,6 +106,7 @@ def test_every_point_has_enough_views_and_one_per_image(made: Production) -> Non
         assert len(set(images)) == len(images)
 
 
+@pytest.mark.thorough
 def test_points_near_the_border_of_an_image_have_enough_views() -> None:
     # The second adjustment moves points: chips at the border of an image are then no longer whole.
     many = ProductionOptions(

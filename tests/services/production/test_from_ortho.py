@@ -122,7 +122,7 @@ def test_missing_pixels_and_unknown_heights_give_no_points() -> None:
     np.testing.assert_allclose(points.lon_lat_h[:, 2], 40.0)
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_scattered_saturated_pixels_cost_no_points() -> None:
     pixels = land().copy()
     pixels[np.random.default_rng(5).random(pixels.shape) < 300e-6] = np.inf
@@ -149,7 +149,7 @@ def test_a_patch_without_data_costs_the_points_that_it_covers() -> None:
     assert missing.max() <= 0.1
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_the_height_of_the_surface_is_unknown() -> None:
     # A terrain model does not say whether roofs and trees are in it, and one image does not show it.
     grid = ortho(land()).model.grid  # type: ignore[attr-defined]

@@ -194,7 +194,7 @@ def test_too_few_points_are_refused_with_the_counts() -> None:
         produce_known_points(ground(far), [ortho(land())], UNKNOWN_FRAME)
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_points_stay_where_the_file_has_them_whatever_the_order_of_the_images() -> None:
     file = ground(places(6))
     for scenes in ([date(0, 0.0), date(1, 0.0)], [date(1, 0.0), date(0, 0.0)]):

@@ -14,7 +14,7 @@ from services.simulation.view import SimulatedView
 from services.types import Frame, Observations
 from tests.services.production.simulated_control import CHI2_3, frame_error_m, free, placed, views
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 SEEDS = (12, 22, 23)
 POINT_SIGMA_M = np.array([0.2, 0.2, 0.3])

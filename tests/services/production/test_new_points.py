@@ -121,6 +121,7 @@ def test_the_hole_is_the_ground_without_points() -> None:
     assert shown_twice(ground, registered(SEEDS[0])) > 0
 
 
+@pytest.mark.thorough
 def test_new_points_fill_the_hole_one_in_each_square() -> None:
     made, ground = filled(SEEDS[0]), hole()
     _, block, outline = older()
@@ -138,6 +139,7 @@ def test_new_points_fill_the_hole_one_in_each_square() -> None:
         assert made.chips(row).shape == (mine.stop - mine.start, 101, 101)
 
 
+@pytest.mark.thorough
 def test_new_points_are_in_the_frame_of_the_block_as_precisely_as_they_declare() -> None:
     # One scene and one sun: the height of content shifts by half a metre with the shadows.
     assert 0.5 < normalised(SEEDS[0], range(1)) < 1.7

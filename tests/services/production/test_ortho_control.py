@@ -20,7 +20,7 @@ from tests.services.quality.test_site_images import vertical_ortho
 from tests.services.registration.test_on_reference import grid, positions
 from tests.services.simulated import world
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 SEEDS = (12, 21, 22)
 ORTHO_SIGMA_M = 0.5

@@ -17,7 +17,7 @@ from tests.services.production.test_ortho_control import heights, reference
 from tests.services.simulated import OPTIONS
 from tests.services.ties import difference_m
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 SEED = 21
 SIGMA_M = 1.0

@@ -88,7 +88,7 @@ def earth_sigmas_m(relative_m2: Array, frame_m2: Array) -> Array:
 
 
 @pytest.mark.parametrize("plan", [PLAN, MIXED], ids=["stereo", "with an ortho-image"])
-@pytest.mark.long
+@pytest.mark.thorough
 def test_the_prediction_is_what_the_adjustment_declares(plan: BlockPlan) -> None:
     geometry = plan_geometry(plan)
     predicted = block_of(plan, geometry, [0])
@@ -104,7 +104,7 @@ def test_the_prediction_is_what_the_adjustment_declares(plan: BlockPlan) -> None
     assert np.quantile(np.abs(np.mean([np.median(r, axis=0) for r in ratios], axis=0) - 1.0), 1.0) < 0.1
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_the_proposed_site_is_the_best_of_all_in_the_adjustment() -> None:
     geometry = plan_geometry(PLAN)
     found = forecast(PLAN)

@@ -16,7 +16,7 @@ from services.types import Array
 from tests.services.production.test_from_ortho import FLAT, GSD_M, SIDE, chips_of, land, ortho
 from tests.services.textures import as_pixels, texture
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 OPTIONS = OrthoPointOptions(points=100)
 LOCAL_PX = 0.8

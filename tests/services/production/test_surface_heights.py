@@ -34,7 +34,7 @@ from tests.services.simulated import (
     world,
 )
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 honest = (0.7, 1.5)
 """Mean square of errors over their sigmas."""

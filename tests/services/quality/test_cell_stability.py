@@ -9,6 +9,8 @@ from services.errors import NotEnoughPoints
 from services.quality.cell_stability import CELLS, measure_cell_stability
 from services.quality.stability import measure_stability
 
+pytestmark = pytest.mark.thorough
+
 SEEDS = range(12)
 
 

@@ -18,7 +18,7 @@ from services.simulation.view import SimulatedView, plan_geometry
 from services.types import Array, ControlPoints
 from tests.services.simulated import block, plan, spoiled_view, world
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 HALF_THE_SCENE_M = (310.0, -160.0)
 """East and north; the scene is 700 m wide."""

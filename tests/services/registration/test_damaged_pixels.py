@@ -12,7 +12,7 @@ from services.simulation.view import SimulatedView
 from services.types import FloatImage
 from tests.services.simulated import block, spoiled_view
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 five_percent = 0.05
 SIGMA_M = 15.0

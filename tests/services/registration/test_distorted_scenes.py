@@ -103,6 +103,7 @@ def test_jitter_and_bow_are_followed_with_the_stated_accuracy(name: str) -> None
     assert np.quantile(np.hypot(*error.T), 0.9) < 1.2
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["repeated lines", "lost lines"])
 def test_lost_and_repeated_lines_are_followed_on_both_sides(name: str) -> None:
     result = registered(name)
@@ -140,6 +141,7 @@ def test_ground_that_moved_is_named_and_the_rest_stays_right() -> None:
     assert ratio("moved ground") < WRONG
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", IN_THE_MIDDLE)
 def test_ground_that_moved_in_the_middle_is_not_taken_for_the_scene(name: str) -> None:
     """The points found first agree on the place of the ground that moved: most of them lie on it."""

@@ -12,7 +12,7 @@ from services.registration.on_points import Registration, register_scene
 from services.types import ChipArray, ChipSource
 from tests.services.registration.wide_ground import CENTRE, true_model, wide_points, wide_scene
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 SCENE = (10_000.0, 2.0, 5_000)
 """Size of the scene, ground sampling, side of what is delivered of it."""

@@ -213,6 +213,7 @@ def test_the_same_scene_is_registered_the_same() -> None:
     assert again.qualification.verdict == first.qualification.verdict
 
 
+@pytest.mark.thorough
 def test_a_scene_of_another_world_finds_no_consensus() -> None:
     scene = spoiled_view(world_seed=5).as_scene(SIGMA_M)
     with pytest.raises(NoConsensus, match=r"not agree on one correction: .*low_score"):
@@ -260,6 +261,7 @@ def test_five_points_are_too_few() -> None:
         register_scene(scene, points.take(np.arange(5)), chips)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["bright", "missing"])
 def test_a_scene_mostly_under_clouds_is_registered_where_it_shows_and_not_called_good(kind: str) -> None:
     # Of the five columns of cells that the coverage counts, three are covered.

@@ -141,6 +141,7 @@ def crop_of(view: SimulatedView, sigma_m: float) -> Scene:
     )
 
 
+@pytest.mark.thorough
 def test_a_small_scene_off_by_most_of_its_size_ends_where_a_good_start_does() -> None:
     """The places that the scene shows lie beside the ground that its model predicts."""
     far = register_on_reference(crop_of(spoiled_view((215.0, -160.0)), 100.0), reference(), OPTIONS)

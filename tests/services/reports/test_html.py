@@ -180,7 +180,7 @@ def test_a_page_is_made_of_any_registration(material, poor):
     )
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_a_page_of_thousands_of_points_stays_light(material):
     """A large scene has 1,800 points (SPOT 6/7); a mail takes 10 MB."""
     megabyte = 1_000_000

@@ -29,7 +29,7 @@ def geometry(world: World, gsd_m: float = 0.5, **changes: object) -> ViewGeometr
 
 
 @pytest.mark.parametrize("gsd_m", [0.3, 0.5, 1.7, 6.0])
-@pytest.mark.long
+@pytest.mark.thorough
 def test_tiles_make_up_the_image_that_is_rendered_line_by_line(world: World, gsd_m: float) -> None:
     silent = Radiometry(noise_floor=0.0, noise_per_signal=0.0)
     taken = geometry(world, gsd_m, radiometry=silent)

@@ -189,7 +189,7 @@ def test_two_views_of_one_day_correlate(world: World) -> None:
     assert np.median(correlations(world, first, second)) > 0.85
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_views_of_different_days_correlate_less_but_mostly_well(world: World) -> None:
     rng = np.random.default_rng(0)
     first = simulate_view(world, plan(world, acquired_at=SUMMER), rng)

@@ -193,6 +193,7 @@ def test_a_block_across_the_antimeridian_is_valid(tmp_path):
     assert_allclose(document["extent"]["spatial"]["bbox"][0], [179.9, -17.0, -179.9, -16.9])
 
 
+@pytest.mark.thorough
 @settings(max_examples=100, deadline=None)
 @given(data=st.data())
 def test_garbled_documents_raise_nothing_but_format_errors(block_text, data):

@@ -144,6 +144,7 @@ def test_a_geoid_of_another_region_is_refused(tmp_path: Path) -> None:
         read_dem(write_dem(tmp_path / "a.tif"), geoid=grid)
 
 
+@pytest.mark.thorough
 @settings(max_examples=40)
 @given(cut=st.integers(0, 6700), start=st.integers(0, 60), noise=st.binary(min_size=1, max_size=40))
 def test_a_damaged_geoid_is_refused_or_still_a_geoid(

@@ -400,7 +400,7 @@ def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", FILES)
 @given(data=st.data())
 @settings(max_examples=60)
-@pytest.mark.long
+@pytest.mark.thorough
 def test_a_garbled_file_gives_points_or_an_amers_error(name: str, data: st.DataObject) -> None:
     text = TEXTS[name]
     start = data.draw(st.integers(0, len(text)))

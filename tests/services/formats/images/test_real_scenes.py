@@ -219,7 +219,7 @@ def matched(a: Scene, b: Scene) -> tuple[Array, Array]:
         ("phr_iceland_pair", ("img_01.tif", "img_02.tif"), 0.26, (1460.0, 1560.0)),
     ],
 )
-@pytest.mark.long
+@pytest.mark.thorough
 def test_the_rays_of_a_pair_intersect_at_plausible_heights(
     real_data: Path,
     folder: str,

@@ -10,7 +10,7 @@ from services.adjustment.rigorous_parameters import rigorous_parameters
 from services.formats.sensor_models.rigorous_model import read_rigorous_model
 from services.sensors.parameter_sets import TOUTIN
 
-pytestmark = pytest.mark.real_data
+pytestmark = [pytest.mark.real_data, pytest.mark.thorough]
 
 
 @pytest.fixture(scope="module")
