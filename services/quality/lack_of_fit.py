@@ -12,7 +12,7 @@ from scipy.special import comb
 from services.adjustment.broken_image import FEWEST_IN_PART, held_parts, part_of_line
 from services.adjustment.structure import Family, Structure
 from services.quality.criteria import Criterion, Grade, at_most
-from services.quality.missed_along import UNFOUND, missed_along
+from services.quality.missed_along import UNFOUND, missed_along, missed_at_borders
 from services.types import Array, BoolArray, IntArray
 
 _CRITERIA: dict[Family, str] = {
@@ -159,7 +159,8 @@ def missed_criterion(
 ) -> Criterion:
     """The criterion on lines, or samples, whose points do not agree, where those of others do.
 
-    Of samples, points that were found count alone: haze or water may hide a side of an image.
+    Of samples, and at the borders, points that were found count alone: haze or water may hide a side
+    of an image.
 
     Args:
         along: of what.
@@ -174,7 +175,8 @@ def missed_criterion(
     tried = active | np.isin(reason, disagree)
     if shown is not None:
         tried &= shown | active
-    missed = missed_along(position, active, tried)
+    found = tried & (active | (reason == "deactivated"))
+    missed = missed_along(position, active, tried) | missed_at_borders(position, active, found)
     if not missed.any():
         return at_most(name, 0.0, 0.0, "good")
     beside = tried & ~missed

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from services.quality.lack_of_fit import missed_criterion
-from services.quality.missed_along import missed_along
+from services.quality.missed_along import missed_along, missed_at_borders
 
 LINES = 2000
 
@@ -128,3 +128,39 @@ def test_chips_that_a_break_of_the_image_cuts_do_not_count() -> None:
     reason = np.where(cut, "deactivated", "")
     assert not missed_criterion("lines", line, ~cut, reason, LINES).met
     assert missed_criterion("lines", line, ~cut, reason, LINES, shown=~cut).met
+
+
+@pytest.mark.parametrize("share", [0.05, 0.2, 0.4])
+def test_points_left_out_at_random_accuse_no_border(share: float) -> None:
+    rng = np.random.default_rng([16, round(100 * share)])
+    accused = 0
+    for _ in range(4000):
+        line = places(rng, 70)
+        accused += missed_at_borders(line, rng.random(70) >= share, np.ones(70, dtype=bool)).any()
+    assert accused <= 20, "half of one in a hundred: the other half is that of the samples"
+
+
+def test_few_points_of_the_other_image_at_a_border_accuse_its_lines() -> None:
+    rng = np.random.default_rng(17)
+    for _ in range(50):
+        line = np.concatenate([rng.uniform(0.0, 300.0, 5), rng.uniform(320.0, LINES, 130)])
+        reason = np.full(135, "", dtype=object)
+        reason[:5] = "deactivated"
+        reason[5:70] = "low_score"  # hidden here and there: they say nothing of either part
+        reason[rng.choice(np.arange(70, 135), 8, replace=False)] = "deactivated"
+        active = reason == ""
+        criterion = missed_criterion("lines", line, active, reason.astype(str), LINES)
+        turned = missed_criterion("lines", LINES - line, active, reason.astype(str), LINES)
+        assert (criterion.met, criterion.needed_for) == (False, "usable")
+        assert 12.0 <= criterion.value <= 25.0
+        assert turned.value == pytest.approx(criterion.value)
+
+
+def test_points_that_are_not_found_or_three_that_disagree_accuse_no_border() -> None:
+    line = np.linspace(0.0, LINES - 1.0, 100)
+    agrees = np.arange(100) >= 6
+    assert not missed_at_borders(line, agrees, agrees).any()
+    three = np.arange(100) >= 3
+    assert not missed_at_borders(line, three, np.ones(100, dtype=bool)).any()
+    four = np.arange(100) < 96
+    np.testing.assert_array_equal(missed_at_borders(line, four, np.ones(100, dtype=bool)), ~four)
