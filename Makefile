@@ -16,7 +16,7 @@ PYTEST := $(BIN)/python -m pytest -p no:schemathesis --dist loadfile --no-loadsc
 APART := not endurance and not qgis
 LONG := cape_verde continent distorted faults image_selection load stress throughput block_adjustment toutin
 
-.PHONY: demo test test-thorough test-files test-operations test-fast test-security test-endurance test-qgis check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput mutants postgis page chromium pictures plugin
+.PHONY: demo test test-thorough test-files test-operations test-shuffled test-fast test-security test-endurance test-qgis check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput mutants postgis page chromium pictures plugin
 
 demo: postgis
 	$(BIN)/amers demo
@@ -39,6 +39,12 @@ programs: $(READY)
 
 test-files: $(READY)
 	$(PYTEST) -m "not thorough and $(APART)" -n $(WORKERS) --ignore tests/app/test_openapi.py
+
+# The same in an order that is drawn, to find tests that need others before them; SEED=7 draws that one again.
+test-shuffled: $(READY)
+	$(MAKE) --jobs 2 kernels programs
+	$(PYTEST) -p randomly $(if $(SEED),--randomly-seed $(SEED)) -m "not thorough and $(APART)" -n $(WORKERS) \
+		--ignore tests/app/test_openapi.py
 
 # All operations have one name, of which files handed out as a whole run only the first.
 test-operations: $(READY)
