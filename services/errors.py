@@ -9,6 +9,7 @@ AmersError
 └── ComputationError        the input is valid, but gives no trustworthy result
     ├── NotEnoughPoints
     ├── NoConsensus
+    │   └── TurnedImage     they agree on an image whose axes are others than those of its model
     ├── UndeterminedCorrection
     ├── DisconnectedBlock
     ├── DoesNotFit
@@ -63,6 +64,10 @@ class NotEnoughPoints(ComputationError):
 
 class NoConsensus(ComputationError):
     """The measures do not agree on one correction."""
+
+
+class TurnedImage(NoConsensus):
+    """The measures agree on an image that is mirrored, upside down or whose axes are swapped."""
 
 
 class UndeterminedCorrection(ComputationError):

@@ -6,7 +6,7 @@ import numpy as np
 
 from services.adjustment.image_correction import SceneAdjustment
 from services.conventions import CHIP_SIZE
-from services.errors import ComputationError, CoverageError, NoConsensus, NotEnoughPoints
+from services.errors import ComputationError, CoverageError, NoConsensus, NotEnoughPoints, TurnedImage
 from services.imagery.line_breaks import scene_breaks
 from services.imagery.scene import Scene
 from services.imagery.source import CachedImage
@@ -102,8 +102,8 @@ def register_scene(
     Raises:
         CoverageError: no point lies in the scene.
         NotEnoughPoints: too few points were found.
-        NoConsensus: the points found do not agree on one correction, or they agree on an image that is
-            turned.
+        NoConsensus: the points found do not agree on one correction.
+        TurnedImage: they agree on an image that is turned.
     """
     try:
         context, search, _ = search_scene(
@@ -113,7 +113,7 @@ def register_scene(
         turned = _how_it_is_turned(scene, points, chips, options)
         if not turned:
             raise
-        raise NoConsensus(f"the image is {turned} ({error})") from error
+        raise TurnedImage(f"the image is {turned} ({error})") from error
     search, adjustment, elsewhere = adjust_with_places(context, search)
     return build_registration(context, context.points, search, adjustment, elsewhere)
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from services.conventions import MAX_ERROR_SIGMAS
-from services.errors import CoverageError, NoConsensus, NotEnoughPoints
+from services.errors import CoverageError, NoConsensus, NotEnoughPoints, TurnedImage
 from services.quality.accuracy_statement import AccuracyStatement, StatedAccuracy, no_accuracy
 from services.registration.context import SearchStage
 from services.registration.search import larger_sigma_m
@@ -100,6 +100,9 @@ def next_steps(
         error, (CoverageError, NoConsensus, NotEnoughPoints)
     ):
         return (NextStep("Correct what the reason names, and run the registration again.", command),)
+    if isinstance(error, TurnedImage):
+        text = "Turn the image or its model as the reason says, and run the registration again."
+        return (NextStep(text, command),)
     if not stages:
         return (*_find_control(scene, command), _state_larger(scene, command))
     last = stages[-1]

@@ -25,6 +25,8 @@ from services.types import UNKNOWN_FRAME, Frame
 CORRECTION_JSON = "correction.json"
 FIT_LIMIT_PX = 0.1
 """An RPC that misses its adjusted rigorous model by more is written with a warning."""
+_LEAST_PX = 0.001
+"""What a fit leaves below this is arithmetic."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +151,7 @@ def _write_rpc(
     files = write_model(delivered, refined.model, folder, copied)
     names = ", ".join(file.name for file in files)
     exact = refined.max_error_px == 0.0
-    how = "exactly" if exact else f"fitted within {refined.max_error_px:.2g} px"
+    how = "exactly" if exact else f"fitted within {max(refined.max_error_px, _LEAST_PX):.2g} px"
     if refined.max_error_px > LOUD_PX:
         how = (
             f"up to {refined.max_error_px:.2g} px OFF: no RPC follows lines and samples so. Use "

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.errors import NoConsensus
+from services.errors import TurnedImage
 from services.quality.normal_law import normal_ce90
 from services.registration.on_points import Registration, register_scene
 from services.simulation.distortion import (
@@ -128,7 +128,7 @@ def test_lines_that_are_repeated_beyond_all_points_are_named() -> None:
 
 @pytest.mark.parametrize("name", ["swapped", "mirrored", "upside down"])
 def test_an_image_that_is_turned_is_refused_with_this_reason(name: str) -> None:
-    with pytest.raises(NoConsensus, match=f"the image is {name}"):
+    with pytest.raises(TurnedImage, match=f"the image is {name}"):
         registered(name)
 
 

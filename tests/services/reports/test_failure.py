@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 
-from services.errors import CoverageError, FormatError, NoConsensus, NotEnoughPoints
+from services.errors import CoverageError, FormatError, NoConsensus, NotEnoughPoints, TurnedImage
 from services.registration.context import Candidate, NotFound, SearchStage
 from services.registration.options import RegistrationOptions
 from services.reports.document import failure_schema, report_document
@@ -124,6 +124,12 @@ def test_a_search_of_the_middle_of_a_scene_says_so(report):
     assert "middle" not in " ".join(
         step.text for step in next_steps(NoConsensus(""), report.scene, (STAGE,), COMMAND)
     )
+
+
+def test_a_turned_image_is_to_be_turned_and_not_searched_farther(report):
+    (step,) = next_steps(TurnedImage("upside down"), report.scene, (STAGE,), COMMAND)
+    assert step.text.startswith("Turn the image or its model")
+    assert step.command == COMMAND
 
 
 def test_without_a_visible_point_the_ground_is_looked_up(report):
