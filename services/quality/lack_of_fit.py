@@ -155,7 +155,7 @@ def missed_criterion(
     reason: np.ndarray,
     size: int,
     *,
-    shown: BoolArray | None = None,
+    counts: BoolArray | None = None,
 ) -> Criterion:
     """The criterion on lines, or samples, whose points do not agree, where those of others do.
 
@@ -168,13 +168,14 @@ def missed_criterion(
         active: (n,) those that the adjustment uses.
         reason: (n,) why others are not.
         size: lines or samples of the image.
-        shown: (n,) points whose chips no break of the image cuts; all when None.
+        counts: (n,) points that count beside the active ones: neither cut by a break of the image nor
+            where the scene says, as far as its accuracy goes; all when None.
     """
     name = f"missed_along_{along}"
     disagree = (*UNFOUND, "deactivated") if along == "lines" else ("deactivated",)
     tried = active | np.isin(reason, disagree)
-    if shown is not None:
-        tried &= shown | active
+    if counts is not None:
+        tried &= counts | active
     found = tried & (active | (reason == "deactivated"))
     missed = missed_along(position, active, tried) | missed_at_borders(position, active, found)
     if not missed.any():

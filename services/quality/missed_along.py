@@ -15,7 +15,7 @@ UNFOUND = ("low_score", "ambiguous", "border_peak", "views_disagree")
 _MAX_CHANCE = 0.01
 _MOST_GAPS = 3
 _FEWEST = 4
-_BORDERS = 4
+_BORDERS, _FEWEST_AT_BORDER = 4, 3
 _MOST_ENDS = 400
 """Points at which intervals begin, and at which they end: dense references have thousands."""
 _HARDLY_ANY = 0.1
@@ -69,7 +69,7 @@ def missed_at_borders(position: Array, agrees: BoolArray, found: BoolArray) -> B
         run = int(np.argmax(agrees[ordered]))
         drawn = np.arange(run)
         chance = _BORDERS * float(np.prod((n_left_out - drawn) / (n - drawn)))
-        if run >= _FEWEST and chance <= _MAX_CHANCE:
+        if run >= _FEWEST_AT_BORDER and chance <= _MAX_CHANCE:
             missed[ordered[:run]] = True
     return missed
 

@@ -350,6 +350,8 @@ def _of_fit(scene: AdjustedScene, predicted_px: float) -> list[Criterion]:
     displaced = against_height(scene.elsewhere, sight, predicted_px)
     if displaced is not None:
         structures = [displaced if one.name == displaced.name else one for one in structures]
+    # A point that lies within the stated accuracy says nothing against it, however well others agree.
+    off = ~(np.hypot(*(measures.line_sample - expected).T) <= predicted_px)
     return [
         *structures,
         *_behind_breaks(scene),
@@ -359,17 +361,19 @@ def _of_fit(scene: AdjustedScene, predicted_px: float) -> list[Criterion]:
             measures.active,
             measures.reason,
             scene.shape[0],
-            shown=_whole(scene, expected),
+            counts=off & _whole(scene, expected),
         ),
-        missed_criterion("samples", expected[:, 1], measures.active, measures.reason, scene.shape[1]),
+        missed_criterion(
+            "samples", expected[:, 1], measures.active, measures.reason, scene.shape[1], counts=off
+        ),
         elsewhere_criterion(scene.elsewhere, expected, measures.active, scene.shape),
     ]
 
 
-def _whole(scene: AdjustedScene, expected: Array) -> BoolArray | None:
-    """Points (n,) expected at places (n, 2) whose chips no break of the image cuts; None for all."""
+def _whole(scene: AdjustedScene, expected: Array) -> BoolArray:
+    """Points (n,) expected at places (n, 2) whose chips no break of the image cuts."""
     if scene.breaks is None:
-        return None
+        return np.ones(len(expected), dtype=bool)
     side_px = CHIP_SIZE * scene.control_gsd_m / scene.gsd_m
     return on_one_side(scene.breaks, expected[:, 0], side_px, 0.0)
 

@@ -386,3 +386,22 @@ def test_a_frame_that_nobody_stated_does_not_meet_a_limit_on_the_earth(registere
     assert result.verdict == "failed"
     (criterion,) = [c for c in result.criteria if not c.met]
     assert criterion.note == "unknown: nobody stated the frame of the control points"
+
+
+@pytest.mark.parametrize("along", [0, 1])
+def test_points_at_a_border_speak_against_a_scene_beyond_its_stated_accuracy_alone(registered, along):
+    scene = registered()
+    rows = np.argsort(scene.measures.line_sample[:, along])[:5]
+    name = ("missed_along_lines", "missed_along_samples")[along]
+    for times, told in ((0.8, False), (1.2, True)):
+        adjusted = scene.adjusted(None)
+        expected = adjusted.model.project(scene.measures.lon_lat_h)
+        predicted_px = np.median(predict_accuracy(adjusted, DEFAULT.grid).ce90_px)
+        place = scene.measures.line_sample.copy()
+        place[rows] = expected[rows] + [0.0, times * predicted_px]
+        active, reason = scene.measures.active.copy(), scene.measures.reason.copy().astype(object)
+        active[rows], reason[rows] = False, "deactivated"
+        measures = replace(scene.measures, line_sample=place, active=active, reason=reason.astype(str))
+        assert (
+            name in {name for name, _ in failed(qualified(replace(scene, measures=measures)))}
+        ) is told
