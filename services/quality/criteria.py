@@ -111,8 +111,8 @@ _DESCRIPTIONS = {
         "Second consensus / active",
         "",
         2,
-        "Largest group of deactivated points that agree on another displacement, divided by the active "
-        "points.",
+        "Largest group of deactivated points that agree on another displacement, beyond the predicted "
+        "CE90, divided by the active points.",
     ),
     "structure_along_lines": _Description(
         "Residuals along the lines",

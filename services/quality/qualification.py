@@ -223,6 +223,7 @@ def qualify_repeated(
     if point_counts.active < _ENOUGH_RESIDUALS and np.isfinite(tie_residual_px):
         residual_std_px = shown_residual_std_px = tie_residual_px
     predicted = predict_accuracy(scene, options.grid)
+    stated_px = float(np.median(predicted.ce90_px))
     coverage = image_coverage(measures.line_sample[measures.active], shape, options.coverage_cells)
     figures = _Figures(
         active_points=point_counts.active,
@@ -233,12 +234,12 @@ def qualify_repeated(
         displacement_px=max((place.median_px for place in stability.displacements), default=np.nan),
         predicted_ce90_px=predicted.worst_px,
         unit_weight=adjustment.sigma0,
-        second_consensus_share=second_consensus_share(measures),
+        second_consensus_share=second_consensus_share(measures, stated_px),
     )
     control_px = max(scene.control_gsd_m / scene.gsd_m, 1.0)
     criteria = (
         *_criteria(figures, options, scene.gsd_m, control_px),
-        *_of_fit(scene, float(np.median(predicted.ce90_px))),
+        *_of_fit(scene, stated_px),
     )
     if options.max_ce90_on_earth_m is not None:
         criteria += (_on_earth(predicted, options.max_ce90_on_earth_m, scene.frame),)
@@ -294,16 +295,21 @@ def unexplained_px(measures: Measures, point_sigma_px: Array) -> float:
     return float(np.sqrt(np.maximum(residual.var(axis=0, ddof=1) - explained, 0.0).max()))
 
 
-def second_consensus_share(measures: Measures) -> float:
+def second_consensus_share(measures: Measures, stated_px: float) -> float:
     """Largest group of deactivated points that agree on another displacement, over the active points.
 
     Points agree when their residuals are as near to each other as those of the active points are to
-    zero.
+    zero. A displacement that is no larger than the accuracy of the scene is no other one.
+
+    Args:
+        measures: of all points.
+        stated_px: CE90 of the scene.
     """
     active = measures.residual_px[measures.active]
     if len(active) == 0:
         return float("nan")
     deactivated = measures.residual_px[measures.matched & ~measures.active]
+    deactivated = deactivated[~(np.hypot(*deactivated.T) <= stated_px)]
     tolerance_px = consensus_tolerance_px(float(np.sqrt((active**2).mean())))
     largest_px = float(np.abs(deactivated).max(initial=tolerance_px))
     second = a_contrario_consensus(deactivated, tolerance_px, largest_px)

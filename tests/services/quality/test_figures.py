@@ -148,7 +148,7 @@ def test_a_second_consensus_is_that_of_another_order_and_of_swapped_axes(registe
     order = rng.permutation(60)
     permuted = replace(measures, residual_px=residual[order], active=measures.active[order])
     swapped = replace(measures, residual_px=residual[:, ::-1])
-    shares = [second_consensus_share(one) for one in (measures, permuted, swapped)]
+    shares = [second_consensus_share(one, 0.0) for one in (measures, permuted, swapped)]
     assert shares == [12 / 40] * 3
 
 

@@ -319,10 +319,12 @@ def test_two_consensuses_of_many_points_are_not_good(registered):
     residual_px[:25] += [8.0, -3.0]
     active[:25] = False
     two = replace(scene.measures, residual_px=residual_px, active=active)
-    assert second_consensus_share(two) == pytest.approx(25 / active.sum())
+    for stated_px in (0.0, 7.5):
+        assert second_consensus_share(two, stated_px) == pytest.approx(25 / active.sum())
+    assert second_consensus_share(two, 9.5) == 0.0, "within the accuracy of the scene"
     assert ("second_consensus_share", "good") in failed(qualified(replace(scene, measures=two)))
     residual_px[:25] += np.random.default_rng(1).uniform(-60.0, 60.0, (25, 2))
-    assert second_consensus_share(replace(two, residual_px=residual_px)) < 0.2
+    assert second_consensus_share(replace(two, residual_px=residual_px), 0.0) < 0.2
 
 
 def test_nineteen_active_points_are_never_good(registered):
