@@ -42,7 +42,8 @@ class Distorted:
         normalised: mean of the delivered; NaN without any.
         of_predicted: true over predicted CE90 of the delivered: median, largest; NaN without any.
         followable, followed: scenes whose distortion the points resolve, and those of them right.
-        not_right, named: scenes that are not right, and those of them with a criterion of their family.
+        not_followed, named: scenes refused, or off by more than three times what they predict whatever
+            their verdict is, and those of them with a criterion of their family.
         told_by: how often each criterion was not met in scenes that are not right.
     """
 
@@ -59,7 +60,7 @@ class Distorted:
     of_predicted: tuple[float, float]
     followable: int
     followed: int
-    not_right: int
+    not_followed: int
     named: int
     told_by: dict[str, int]
 
@@ -73,6 +74,7 @@ def figures_of(family: str, outcomes: Sequence[Outcome]) -> Distorted:
     """The figures of some scenes of a family."""
     delivered = [o for o in outcomes if o.delivered]
     not_right = [o for o in outcomes if not is_right(o)]
+    not_followed = [o for o in outcomes if o.wrong or o.wrong_in_part]
     followable = [o for o in outcomes if o.followable]
     ratio = [o.ce90_m / o.predicted_m for o in delivered]
     number = Counter(o.verdict for o in outcomes)
@@ -90,8 +92,8 @@ def figures_of(family: str, outcomes: Sequence[Outcome]) -> Distorted:
         of_predicted=(float(np.median(ratio)), max(ratio)) if ratio else (float("nan"),) * 2,
         followable=len(followable),
         followed=sum(map(is_right, followable)),
-        not_right=len(not_right),
-        named=sum(_is_named(family, o) for o in not_right),
+        not_followed=len(not_followed),
+        named=sum(_is_named(family, o) for o in not_followed),
         told_by=dict(Counter(name for o in not_right for name in _told(o)).most_common()),
     )
 
@@ -135,12 +137,13 @@ def distorted_acceptance(family: str, outcomes: Sequence[Outcome]) -> list[tuple
                 f"{figures.followed} of {figures.followable}",
             )
         )
-    if figures.not_right:
+    if figures.not_followed:
         lines.append(
             (
-                f"what is not delivered and right is named by a criterion of the family in {NAMED:.0%}",
-                figures.named >= NAMED * figures.not_right,
-                f"{figures.named} of {figures.not_right}; not met: {_listed(figures.told_by)}",
+                f"what is not followed is named by a criterion of the family in {NAMED:.0%}",
+                figures.named >= NAMED * figures.not_followed,
+                f"{figures.named} of {figures.not_followed}; not met where not right: "
+                f"{_listed(figures.told_by)}",
             )
         )
     return lines
@@ -157,7 +160,7 @@ def show_distorted(title: str, rows: dict[str, Distorted]) -> None:
         counts = row.scenes, row.good, row.usable, row.failed, row.refused, row.right
         wrong = row.good_but_wrong, row.wrong, row.wrong_in_part
         figures = [f"{value:.2f}" for value in (*row.of_predicted, row.normalised)]
-        told = row.followable, row.followed, row.named, row.not_right
+        told = row.followable, row.followed, row.named, row.not_followed
         cells = [*map(str, counts), *map(str, wrong), *figures, *map(str, told)]
         table.add_row(kind, *cells)
     console = Console(width=200)

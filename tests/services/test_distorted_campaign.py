@@ -171,7 +171,10 @@ def test_outcomes_of_distorted_scenes_are_read_back(tmp_path: Path) -> None:
 
 def test_what_distorted_scenes_must_show_is_told_from_their_outcomes() -> None:
     in_part = replace(RIGHT, wrong_share=0.2)
-    named = replace(RIGHT, verdict="failed", reason="coverage_percent; structure_along_lines")
+    named = replace(
+        RIGHT, verdict="failed", reason="coverage_percent; structure_along_lines", ce90_m=99.0
+    )
+    uncertain = replace(RIGHT, verdict="failed", reason="coverage_percent")
     followable = replace(RIGHT, followable=True)
 
     def holds(outcomes: list[Outcome]) -> list[bool]:
@@ -181,6 +184,7 @@ def test_what_distorted_scenes_must_show_is_told_from_their_outcomes() -> None:
     assert holds([in_part, RIGHT]) == [False, False]
     assert holds([named] * 9 + [REFUSED]) == [True, True]
     assert holds([named] * 8 + [REFUSED] * 2) == [True, False]
+    assert holds([uncertain]) == [True], "what is followed and too uncertain need not be named"
     assert holds([followable] * 4 + [replace(named, followable=True)]) == [True, True, True]
     assert not holds([followable] * 3 + [replace(named, followable=True)])[1]
     rows = by_kind("jitter", [(Drawn("sines"), RIGHT), (Drawn("random"), named)])
