@@ -14,7 +14,7 @@ from services.adjustment.parameters import AdjustableImage, image_parameters, sh
 from services.adjustment.rigorous_parameters import rigorous_parameters
 from services.errors import InputError
 from services.geodesy import lon_lat_h_from_east_north_up
-from services.sensors.parameter_sets import PARAMETER_SETS, SRP, TOUTIN, ParameterSet
+from services.sensors.parameter_sets import PARAMETER_SETS, SPOT_HRV, SRP, TOUTIN, ParameterSet
 from services.sensors.pushbroom import PushbroomModel
 from services.sensors.refined import refined_rpc
 from services.sensors.rpc_fit import fit_rpc
@@ -177,6 +177,26 @@ def test_the_accuracy_on_the_ground_is_the_one_that_is_stated(free: ParameterSet
     moved = [model.locate(centre, middle[:, 2])[0] for model in drawn([image] * 300, rng)]
     error_m = difference_m(np.array(moved), np.repeat(middle, 300, axis=0))
     np.testing.assert_allclose(error_m[:, :2].std(axis=0), SIGMA_M, rtol=0.15)
+
+
+@pytest.mark.parametrize(
+    ("free", "along", "across"),
+    [(TOUTIN, ["along track"], ["across track"]), (SPOT_HRV, ["along track"], ["across track", "radial"])],
+)
+def test_an_orbit_known_worse_than_the_scene_has_nine_tenths_of_its_variance(
+    free: ParameterSet, along: list[str], across: list[str]
+) -> None:
+    image = rigorous(free)[0]
+    middle = image.model.locate((np.array([SHAPE]) - 1.0) / 2.0, np.array([np.mean(HEIGHTS_M)]))
+    computed = image.computed(np.zeros(len(image.sigma)), middle)
+    moved_m = np.linalg.solve(computed.by_ground[0, :, :2], computed.by_parameters[0] * image.sigma)
+    variance_m2 = dict(
+        zip([one.name for one in image.parameters], (moved_m**2).sum(axis=0), strict=True)
+    )
+    for orbit, turn in ((along, "pitch"), (across, "roll")):
+        of_orbit_m2 = sum(variance_m2[name] for name in orbit)
+        assert of_orbit_m2 == pytest.approx(0.9 * SIGMA_M**2, rel=1e-6)
+        assert of_orbit_m2 + variance_m2[turn] == pytest.approx(SIGMA_M**2, rel=1e-6)
 
 
 def test_the_sets_have_the_parameters_that_were_published() -> None:
