@@ -181,7 +181,10 @@ def test_the_accuracy_on_the_ground_is_the_one_that_is_stated(free: ParameterSet
 
 @pytest.mark.parametrize(
     ("free", "along", "across"),
-    [(TOUTIN, ["along track"], ["across track"]), (SPOT_HRV, ["along track"], ["across track", "radial"])],
+    [
+        (TOUTIN, ["along track"], ["across track"]),
+        (SPOT_HRV, ["along track"], ["across track", "radial"]),
+    ],
 )
 def test_an_orbit_known_worse_than_the_scene_has_nine_tenths_of_its_variance(
     free: ParameterSet, along: list[str], across: list[str]
@@ -283,7 +286,10 @@ def test_a_refined_model_delivers_an_rpc_with_its_error_over_the_heights_of_the_
     heights_m = (50.0, 1200.0)
     everywhere, here = refined_rpc(refined, SHAPE), refined_rpc(refined, SHAPE, heights_m)
     assert here.model is not None
-    assert here.max_error_px <= everywhere.max_error_px
+    assert everywhere.model is not None
+    assert everywhere.model.height_range_m == pytest.approx((-500.0, 9000.0))
+    assert here.model.height_range_m == pytest.approx(heights_m)
+    assert here.max_error_px < everywhere.max_error_px
     places = rng.uniform(0.02, 0.98, (4000, 2)) * SHAPE
     ground_there = refined.locate(places, rng.uniform(*heights_m, 4000))
     off_px = np.linalg.norm(here.model.project(ground_there) - places, axis=1).max()
