@@ -89,6 +89,17 @@ def test_the_angle_is_that_between_the_flights() -> None:
     assert np.abs(found.angle_deg - 30.0).max() < 2.0 * a_tenth_of_a_degree
 
 
+def test_the_angle_of_many_rays_is_that_of_the_two_farthest_apart_in_any_order() -> None:
+    wide, narrow = ring_of_geometries(2, incidence_deg=15.0), ring_of_geometries(2, incidence_deg=3.0)
+    for views in (wide + narrow, narrow + wide, [wide[0], *narrow, wide[1]]):
+        ties = make_ties(views, np.random.default_rng(0), 20, NOISE_PX)
+        found = intersect([view.rpc for view in views], ties.observations, 20)
+        assert (found.rays == 4).any()
+        np.testing.assert_allclose(
+            found.angle_deg[found.rays == 4], 30.0, atol=2.0 * a_tenth_of_a_degree
+        )
+
+
 def test_height_is_less_precise_at_a_narrower_angle() -> None:
     std = []
     for incidence in (3.0, 15.0, 30.0):
