@@ -245,6 +245,40 @@ def test_a_new_version_takes_the_places_of_the_old_one(connection, ingest, place
     assert served(connection) == {"good@1": 30}
 
 
+def test_a_new_version_gives_up_the_places_outside_its_outline(connection, ingest, places):
+    """What the version before superseded there is served again, though the new one does not reach it."""
+    both = np.concatenate([places, places + [0.06, 0.0]])
+    ingest("poor", both, frame_sigma_m=5.0)
+    ingest("good", both, frame_sigma_m=0.5)
+    ingest("good", places, frame_sigma_m=0.5, version="2", box=(BOX[0], BOX[1], 5.24, BOX[3]))
+    for name in ("poor", "good@1"):
+        lifecycle.publish_block(connection, name)
+    assert served(connection) == {"good@1": 60}
+    lifecycle.publish_block(connection, "good@2")
+    assert served(connection) == {"good@2": 30, "poor@1": 30}
+
+
+def test_a_block_whose_frame_nobody_stated_gives_way_to_one_that_is_known(connection, ingest, places):
+    ingest("known", places, frame_sigma_m=50.0)
+    ingest("unknown", places)
+    for name in ("known", "unknown"):
+        lifecycle.publish_block(connection, name)
+    assert served(connection) == {"known@1": 30}
+
+
+def test_points_on_both_sides_of_a_gap_between_outlines_are_one_place(connection, ingest):
+    edge_deg, lat_deg = 5.25, np.array([43.22, 43.24, 43.26])
+    metre_deg = 1.0 / metres_per_degree(43.24, 0.0)[0]
+    for name, side, priority in (("west", -1.0, 1), ("east", 1.0, 0)):
+        outline = [BOX[0], BOX[1], edge_deg - 2.0 * metre_deg, BOX[3]]
+        if side > 0.0:
+            outline = [edge_deg + 2.0 * metre_deg, BOX[1], BOX[2], BOX[3]]
+        lon_deg = np.full(3, edge_deg + 4.0 * side * metre_deg)
+        ingest(name, np.column_stack([lon_deg, lat_deg]), priority, box=tuple(outline))
+        lifecycle.publish_block(connection, name)
+    assert served(connection) == {"west@1": 3}
+
+
 def test_one_place_is_one_place_across_the_antimeridian(connection, ingest):
     box = (179.9, -17.0, -179.9, -16.9)
     lon_lat = np.array([[179.95, -16.95], [-179.95, -16.95]])
@@ -321,6 +355,29 @@ def test_publications_wait_for_each_other(dsn):
         with pytest.raises(Exception, match="lock timeout"):
             superseding.lock_publications(other)
         other.rollback()
+
+
+def test_a_priority_given_at_once_with_another_is_seen_by_it(connection, ingest, dsn, places):
+    """Both administrators begin where the first block has 1 and the second 0."""
+    for name, priority in (("first", 1), ("second", 0)):
+        ingest(name, places, priority=priority)
+        lifecycle.publish_block(connection, name)
+    connection.commit()
+
+    def prioritise_second() -> None:
+        with engine.connect(dsn) as other:
+            lifecycle.prioritise_block(other, "second", 3)
+
+    waiting = "select count(*) as n from pg_stat_activity where wait_event_type = 'Lock'"
+    waiting += " and datname = current_database()"
+    with engine.connect(dsn) as one, ThreadPoolExecutor(1) as administrators:
+        lifecycle.prioritise_block(one, "first", 5)
+        later = administrators.submit(prioritise_second)
+        while not later.done() and not run_sql(connection, waiting).fetchone()["n"]:
+            connection.rollback()
+        one.commit()
+        later.result()
+    assert served(connection) == {"first@1": 30}
 
 
 def test_no_degree_of_latitude_is_shorter_than_the_one_of_the_search():
