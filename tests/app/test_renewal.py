@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from app.db import engine
 from app.db.engine import Connection, Database, driver
 from app.db.jobs.attempts import LostJob
 from app.db.points import points_of_block
-from app.db.renewal import StoredSearches
+from app.db.renewal import StoredSearches, find_searches
 from app.errors import Conflict
 from app.storage import Storage
 from app.usecases.blocks import lifecycle
@@ -226,6 +227,20 @@ def test_evidence_of_older_versions_is_not_lost(
     assert len(withdrawals) == 1
     place = model.project(np.array(withdrawals))[0]
     assert np.abs(place - scenes.years.places[scenes.changed]).max() < 1.0
+
+
+def test_a_scene_that_is_registered_again_searches_each_point_once(
+    scenes: Scenes, published: None, database: Database, storage: Storage, tmp_path: Path
+) -> None:
+    """What a scene missed twice is no more evidence than what it missed once."""
+    made = registered(database, storage, scenes.year[0], tmp_path / "out")
+    with database.transaction() as connection:
+        record_registration(connection, made, image_key(scenes.year[0]))
+    with database.reading() as connection:
+        stored = find_searches(connection, "flat", [])
+    assert stored.days.tolist() == [date.fromisoformat(DAYS[0])]
+    assert len(np.unique(stored.lon_lat_h, axis=0)) == len(stored.lon_lat_h) > 0
+    assert stored.found.sum() == made.registration.measures.active.sum()
 
 
 def test_searches_tell_of_the_points_at_exactly_their_places() -> None:
