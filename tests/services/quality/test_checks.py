@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from services.errors import CoverageError
+from services.geodesy import wrapped_degrees
 from services.quality.check_points import MARKING_SIGMA_PX, CheckPoints, check_model, with_check_points
 from services.quality.qualification import QualificationOptions, qualify
 from services.sensors.correction import CorrectedModel
-from services.types import UNKNOWN_FRAME, Frame
-from tests.services.conftest import GSD_M, SHAPE, FlatModel, Registered
+from services.types import UNKNOWN_FRAME, Array, Frame
+from tests.services.conftest import GSD_M, METRE_DEG, SHAPE, FlatModel, Registered
 
 LIMIT = 3.0
 
@@ -79,6 +80,37 @@ def test_marks_without_a_sigma_have_that_of_a_person(registered):
     points = check_points(scene, 200, MARKING_SIGMA_PX)
     unstated = CheckPoints(points.lon_lat_h, points.line_sample, points.sigma_m, np.full(200, np.nan))
     assert checked(scene, unstated) == checked(scene, points)
+
+
+class AcrossTheDateLine(FlatModel):
+    """The same view where the middle column of the image lies at 180 degrees."""
+
+    east_deg = 180.0 - (SHAPE[1] - 1.0) / 2.0 * GSD_M * METRE_DEG
+
+    def project(self, lon_lat_h: Array) -> Array:
+        lon_deg = wrapped_degrees(lon_lat_h[:, 0] - self.east_deg)
+        return super().project(np.column_stack([lon_deg, lon_lat_h[:, 1:]]))
+
+    def locate(self, line_sample: Array, height_m: Array) -> Array:
+        ground = super().locate(line_sample, height_m)
+        ground[:, 0] = wrapped_degrees(ground[:, 0] + self.east_deg)
+        return ground
+
+
+def test_errors_on_the_ground_are_small_across_180_degrees(registered):
+    scene = registered()
+    model = AcrossTheDateLine()
+    rng = np.random.default_rng(4)
+    delivered = rng.uniform(0.0, 1.0, (40, 2)) * (np.array(SHAPE) - 1.0)
+    delivered[:, 1] = (SHAPE[1] - 1.0) / 2.0 + rng.uniform(-0.2, 0.2, 40)
+    marks = scene.truth.apply(delivered) + rng.normal(0.0, 0.3, (40, 2))
+    points = CheckPoints(
+        model.locate(delivered, np.zeros(40)), marks, np.full((40, 3), np.nan), np.full(40, 0.3)
+    )
+    corrected = CorrectedModel(model, scene.adjustment.correction)
+    found_m = check_model(corrected, scene.adjustment, points, UNKNOWN_FRAME).accuracy
+    assert max(found_m.rmse_m) < 2.0 * 0.3 * GSD_M
+    assert set(np.sign(points.lon_lat_h[:, 0])) == {-1.0, 1.0}
 
 
 def test_points_beside_the_scene_are_refused_by_number(registered):
