@@ -534,6 +534,29 @@ def test_offsets_of_blocks_grow_with_the_residuals_of_their_points() -> None:
     assert apart_px(4.0) == pytest.approx(4.0 * apart_px(1.0), rel=1e-3)
 
 
+@pytest.mark.parametrize("blocks", [2, 5])
+def test_blocks_are_seen_to_be_as_far_apart_as_they_were_put(blocks: int) -> None:
+    """Their mean takes a part of each offset: of two blocks one is free."""
+    rng = np.random.default_rng(28)
+    member, true_px, noise_px, draws = np.eye(blocks)[np.arange(10 * blocks) % blocks], 0.8, 0.01, 300
+    unstated, everywhere = np.full((2, blocks), np.nan), np.ones(len(member), dtype=bool)
+    apart_px2 = []
+    for _ in range(draws):
+        misfit = rng.normal(0.0, noise_px, (len(member), 2))
+        misfit += member @ rng.normal(0.0, true_px, (blocks, 2))
+        fit = AffineFit(
+            np.zeros_like(misfit),
+            misfit,
+            np.full_like(misfit, noise_px**2),
+            member,
+            np.full((2, blocks), 1000.0),
+        )
+        _, apart = offset_sigma_px(fit, everywhere, FREE["shift"], np.inf, unit=1.0, stated_px=unstated)
+        apart_px2.append(apart**2)
+    relative_sigma = np.sqrt(2.0 / (2.0 * (blocks - 1) * draws))
+    assert np.mean(apart_px2) == pytest.approx(true_px**2, rel=3.0 * relative_sigma)
+
+
 def test_blocks_that_disagree_do_not_pretend_to_agree() -> None:
     points, block = blocks_apart(0.8, np.random.default_rng(19))
     assert corner_std_px(points, None) < 0.2
