@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from uuid import UUID
 
+import psycopg
 import pytest
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner
@@ -18,6 +19,7 @@ from app.config import Settings
 from app.db import engine, usage
 from app.db.engine import Connection, Database
 from app.db.jobs import attempts, jobs
+from app.db.tokens import Token
 from app.errors import TooLarge
 from app.storage import Storage, open_storage
 from app.usecases import quotas, results
@@ -275,6 +277,35 @@ def test_results_of_jobs_at_the_same_time_cannot_exceed_the_quota_together(
     for thread in threads:
         thread.join()
     assert sorted(outcomes) == ["refused", "reserved"]
+
+
+@pytest.mark.parametrize("counted", ["bytes", "uploads", "jobs"])
+def test_what_a_token_reserves_is_counted_after_what_it_reserves_at_once(
+    settings: Settings, database: Database, counted: str
+):
+    with database.transaction() as connection:
+        me, other = (create_token(connection, name, ["register"]).token for name in ("me", "other"))
+
+    def count(connection: Connection, token: Token) -> None:
+        if counted == "bytes":
+            quotas.require_room(connection, settings, token.id, "the image", 1)
+        elif counted == "uploads":
+            quotas.require_free_upload(connection, settings, token.id)
+        else:
+            quotas.require_free_job(connection, settings, token)
+
+    with database.transaction() as first:
+        count(first, me)
+        with database.transaction() as second:
+            engine.limit_lock_wait(second, 0.1)
+            count(second, other)
+        with database.transaction() as second:
+            engine.limit_lock_wait(second, 0.1)
+            with pytest.raises(psycopg.errors.LockNotAvailable):
+                count(second, me)
+            second.rollback()
+    with database.transaction() as second:
+        count(second, me)
 
 
 @pytest.mark.thorough
