@@ -170,6 +170,23 @@ def test_the_history_of_a_point_is_the_sum_of_its_rows(
     np.testing.assert_allclose([row["expected"] for row in kept], 3 * share, rtol=1e-12)
 
 
+def test_a_point_that_fails_keeps_the_time_when_it_last_served(
+    connection: Connection, stored: Registration
+) -> None:
+    remembered(connection, stored, "a")
+    connection.commit()
+    times = "select last_attempt, last_success from point_history where point_id = %s"
+    point = int(stored.measures.point_id[stored.measures.active][0])
+    served = run_sql(connection, times, [point]).fetchone()
+    assert served["last_success"] == served["last_attempt"]
+    missed = replace(
+        stored.measures, active=stored.measures.active & (stored.measures.point_id != point)
+    )
+    remembered(connection, replace(stored, measures=missed), "b")
+    failed = run_sql(connection, times, [point]).fetchone()
+    assert failed["last_success"] == served["last_success"] < failed["last_attempt"]
+
+
 def test_a_scene_counts_once_however_often_it_is_registered(
     connection: Connection, stored: Registration
 ) -> None:
