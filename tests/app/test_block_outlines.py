@@ -97,6 +97,19 @@ def test_the_outline_of_a_corner_leaves_out_the_ground_that_has_no_points(
     assert beside["features"] == []
 
 
+def test_the_extent_of_a_block_holds_its_outline_and_a_tenth_of_a_metre_more_at_most(ingest):
+    block = ingest(spread(CORNER))
+    rng = np.random.default_rng(6)
+    for _ in range(20):
+        outline = [5.2, -43.2] + rng.uniform(0.0, 0.1, (5, 2))
+        west, south, east, north = block_extent(replace(block, outline=outline))
+        beyond = np.concatenate(
+            [outline.min(axis=0) - [west, south], [east, north] - outline.max(axis=0)]
+        )
+        assert (beyond >= 0.0).all()
+        assert (beyond <= 1.01e-6).all()
+
+
 def test_islands_are_outlined_one_by_one(ingest, outline):
     positions = spread(ISLANDS)
     ingest(positions)
