@@ -49,6 +49,29 @@ def test_connections_that_died_in_the_pool_are_replaced_unseen(dsn: str, databas
             assert connection.scalar(select(func.count()).select_from(block)) == 0
 
 
+def test_a_snapshot_sees_nothing_that_others_commit_meanwhile(dsn: str, database: Database):
+    tokens = select(func.count()).select_from(token)
+    with database.snapshot() as snapshot:
+        assert snapshot.scalar(tokens) == 0
+        with engine.connect(dsn) as other:
+            create_token(other, "meanwhile", ["read"])
+        assert snapshot.scalar(tokens) == 0
+        with pytest.raises(psycopg.errors.ReadOnlySqlTransaction):
+            create_token(snapshot, "of a snapshot", ["read"])
+    with database.snapshot() as snapshot:
+        assert snapshot.scalar(tokens) == 1
+
+
+def test_a_limit_on_waiting_for_locks_ends_with_its_transaction(dsn: str, settings: Settings):
+    setting = select(func.current_setting("lock_timeout"))
+    with engine.pooled(dsn, settings.model_copy(update={"pool_size": 1})) as database:
+        with database.transaction() as connection:
+            engine.limit_lock_wait(connection, 2.5)
+            assert connection.scalar(setting) == "2500ms"
+        with database.transaction() as connection:
+            assert connection.scalar(setting) == "0"
+
+
 def test_statements_of_the_driver_and_expressions_share_one_transaction(dsn: str):
     with engine.connect(dsn) as connection:
         create_token(connection, "kept", ["read"])
