@@ -141,6 +141,33 @@ def test_the_oldest_rows_of_the_audit_are_removed_and_a_row_says_so(
     assert removal.before["rows"] == 2
 
 
+def test_a_young_row_of_the_audit_stays_beside_old_ones_when_the_clock_jumps(
+    database: Database, storage: Storage, settings: Settings
+):
+    with database.transaction() as connection:
+        create_token(connection, "old", ["read"])
+    service_runs(database, 750)
+    with database.transaction() as connection:
+        create_token(connection, "young", ["read"])
+    clock_jumps(database, 5000)
+    sweep_records(database, storage, settings)
+    young, removal = sorted(all_changes(database), key=lambda change: change.id)
+    assert (young.after or {})["name"] == "young"
+    assert removal.subject == f"{young.id - 1}-{young.id - 1}"
+
+
+@pytest.mark.parametrize(("clock_days", "service_days"), [(29, 1000), (1000, 29)])
+def test_the_audit_keeps_rows_that_are_a_month_old_by_clock_or_service_alone(
+    connection: Connection, database: Database, clock_days: int, service_days: int
+):
+    create_token(connection, "kept", ["read"])
+    connection.commit()
+    service_runs(database, service_days)
+    clock_jumps(database, clock_days - service_days)
+    with pytest.raises(psycopg.errors.InsufficientPrivilege, match="30 days after them"):
+        run_sql(connection, "delete from audit")
+
+
 def all_changes(database: Database) -> list:
     with database.transaction() as connection:
         return list_changes(connection, 1000, None, None, None)
