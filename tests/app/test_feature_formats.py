@@ -17,6 +17,7 @@ from pyogrio.raw import read as read_features
 from app.db import superseding
 from app.usecases.blocks import lifecycle
 from app.usecases.features import items
+from app.usecases.history import suspend_point
 from tests.factories import make_block
 from tests.statements import run_sql
 
@@ -214,6 +215,15 @@ def test_a_tile_has_the_features_of_its_place_in_a_layer_of_the_collection(get, 
     )
 
 
+@pytest.mark.parametrize(("z", "level"), [(9, 0), (6, 0), (5, 1), (2, 4), (0, 6)])
+def test_density_cells_are_twice_as_wide_for_each_zoom_before_the_sixth(get, tmp_path, z, level):
+    reply = get(TILES.format("density", z, *tile_of(5.25, 43.25, z)))
+    (tmp_path / "tile.mvt").write_bytes(reply.content)
+    meta, _, _, values = read_features(tmp_path / "tile.mvt", layer="density", CLIP="NO")
+    fields = dict(zip(meta["fields"].tolist(), values, strict=True))
+    assert set(fields["level"].tolist()) == {level}
+
+
 def test_a_tile_states_the_horizontal_accuracy_of_each_point(get, made, tmp_path):
     reply = get(TILES.format("points", 8, *tile_of(5.25, 43.25, 8)))
     (tmp_path / "tile.mvt").write_bytes(reply.content)
@@ -259,6 +269,40 @@ def test_a_registration_that_counts_changes_the_tags_of_points_and_of_no_other_t
         tags.append(get(points).headers["etag"])
     assert len(set(tags)) == 3
     assert [get(other).headers["etag"] for other in others] == before
+
+
+def test_a_tile_has_the_points_of_its_margin_so_that_no_symbol_is_cut(get, made, tmp_path):
+    """The margin is 64 of 4096 parts of a tile: the points nearer to the tile are in it too."""
+    lon, lat = np.radians(made.points.lon_lat_h[:, :2]).T
+    world = np.column_stack([lon / np.pi + 1.0, 1.0 - np.arcsinh(np.tan(lat)) / np.pi]) / 2.0
+    tried = 0
+    for z in range(8, 18):
+        place = world * 2**z
+        beyond = place - np.floor(place)
+        for axis in range(2):
+            parts = 4096.0 * beyond[:, axis]
+            for row in np.flatnonzero((parts > 35.0) & (parts < 62.0)).tolist():
+                column_row = np.floor(place[row]).astype(int)
+                column_row[axis] -= 1
+                reply = get(TILES.format("points", z, *column_row[::-1].tolist()))
+                (tmp_path / "tile.mvt").write_bytes(reply.content)
+                meta, _, _, values = read_features(tmp_path / "tile.mvt", layer="points", CLIP="NO")
+                fields = dict(zip(meta["fields"].tolist(), values, strict=True))
+                assert 2**26 + row in fields["id"], (z, column_row, axis)
+                tried += 1
+    assert tried >= 4
+
+
+def test_the_tag_of_a_tile_changes_when_a_point_is_suspended_and_is_not_that_of_other_viewers(
+    get, client, bearer, connection
+):
+    points, blocks = (TILES.format(name, 8, *tile_of(5.25, 43.25, 8)) for name in ("points", "blocks"))
+    before = get(points).headers["etag"]
+    suspend_point(connection, 2**26 + 3, "a house was built")
+    connection.commit()
+    assert get(points).headers["etag"] != before
+    of_administrators = client.get(blocks, headers=bearer("admin")).headers["etag"]
+    assert of_administrators != get(blocks).headers["etag"]
 
 
 def test_a_tile_that_has_not_changed_is_not_sent_again(made, client, bearer, connection):
