@@ -88,12 +88,12 @@ class FilledVoids:
         if void[inside].any():
             square = (np.arange(-r, r + 1)[:, None] ** 2 + np.arange(-r, r + 1) ** 2).astype(np.float32)
             kernel = np.where((square > 0) & (square <= r * r), 1.0 / np.maximum(square, 1.0), 0.0)
-            valid = np.where(void, np.float32(0.0), np.float32(1.0))
+            # OpenCV filters to doubles what is in doubles; from singles only where the kernel is large.
+            valid = np.where(void, 0.0, 1.0)
             border = cv2.BORDER_CONSTANT
             level = np.float32(np.nanmean(pixels)) if not void.all() else np.float32(0.0)
-            total = cv2.filter2D(
-                np.where(void, 0.0, pixels - level), cv2.CV_64F, kernel, borderType=border
-            )
+            above = np.where(void, 0.0, pixels - level).astype(np.float64)
+            total = cv2.filter2D(above, cv2.CV_64F, kernel, borderType=border)
             weight = cv2.filter2D(valid, cv2.CV_64F, kernel, borderType=border)
             with np.errstate(invalid="ignore", divide="ignore"):
                 filled = np.where(weight > 1e-9, total / weight + level, np.nan)

@@ -25,7 +25,11 @@ HEIGHTS = (500.0 + 3.0 * np.indices(SHAPE)[0] - 2.0 * np.indices(SHAPE)[1]).asty
 
 
 def write_dem(
-    path: Path, crs: str = "EPSG:32631", heights: np.ndarray = HEIGHTS, **options: object
+    path: Path,
+    crs: str = "EPSG:32631",
+    heights: np.ndarray = HEIGHTS,
+    scale_offset: tuple[float, float] | None = None,
+    **options: object,
 ) -> Path:
     transform = from_origin(7e5, 4.8e6, 30.0, 30.0)
     if crs.startswith(("EPSG:4326", "EPSG:4979")):
@@ -42,6 +46,8 @@ def write_dem(
         transform=transform,
         **options,
     ) as file:
+        if scale_offset is not None:
+            file.scales, file.offsets = scale_offset[:1], scale_offset[1:]
         file.write(heights, 1)
     return path
 
@@ -189,6 +195,22 @@ def test_scale_and_offset_of_a_file_are_applied(tmp_path: Path) -> None:
     terrain = read_dem(path, "ellipsoid")
     low, high = terrain.range_m()
     assert (low, high) == pytest.approx((HEIGHTS.min() + 5.0, HEIGHTS.max() + 5.0), abs=a_decimetre)
+
+
+def test_scale_and_offset_of_a_file_are_in_its_unit(tmp_path: Path) -> None:
+    grid, scale_offset = write_geoid(tmp_path / "geoid.gtx"), (0.5, 400.0)
+    in_feet = write_dem(tmp_path / "feet.tif", "EPSG:4326+8228", scale_offset=scale_offset)
+    in_metres = write_dem(tmp_path / "metres.tif", "EPSG:4326", scale_offset=scale_offset)
+    feet, metres = read_dem(in_feet, geoid=grid), read_dem(in_metres, "ellipsoid")
+    expected = 0.3048 * metres.height_m(nodes(metres)) + undulation(nodes(metres))
+    np.testing.assert_allclose(feet.height_m(nodes(metres)), expected, atol=a_millimetre)
+
+
+def test_a_void_gets_the_heights_around_it_by_the_inverse_square_of_their_distance() -> None:
+    heights = np.full((9, 9), np.nan, dtype=np.float32)
+    heights[4, 5], heights[4, 2] = 10.0, 20.0
+    filled = FilledVoids(ArrayImage(heights), 3).read(Window(4, 4, 1, 1))
+    assert filled[0, 0] == pytest.approx((10.0 + 20.0 / 4.0) / (1.0 + 1.0 / 4.0), abs=a_millimetre)
 
 
 def test_filled_voids_do_not_depend_on_the_window() -> None:
