@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+from scipy.spatial.transform import Rotation
 
 from services.errors import FormatError
 from services.formats.sensor_models.dimap_rigorous import parse_dimap_rigorous
@@ -43,6 +44,20 @@ def test_the_model_of_a_simulated_satellite_is_read_from_its_metadata(product: s
     height = rng.uniform(0.0, 4000.0, 500)
     seen = found.project(true.locate(image, height))
     np.testing.assert_allclose(seen, image, atol=a_thousandth_of_a_pixel)
+
+
+def test_lines_of_sight_begin_at_the_perspective_centre_beside_the_middle_of_the_satellite() -> None:
+    true = simulated.truth(GEOMETRIC)
+    text = simulated.worldview_isd(true)
+    aside = text.replace("<CX>0<", "<CX>3.5<").replace("<CY>0<", "<CY>-2<").replace("<CZ>0<", "<CZ>1.5<")
+    image = np.random.default_rng(5).uniform(0.0, 1.0, (50, 2)) * simulated.SHAPE
+    (plain, direction), (moved, moved_direction) = (
+        parse_worldview_isd(one, light_path=GEOMETRIC).line_of_sight(image) for one in (text, aside)
+    )
+    body = Rotation.from_quat(true.attitude(true.line_time(image[:, 0])[:, 0]))
+    centre_m = body.inv().apply(moved - plain)
+    np.testing.assert_allclose(centre_m, np.tile([3.5, -2.0, 1.5], (50, 1)), atol=1e-3)
+    np.testing.assert_allclose(moved_direction, direction, atol=1e-12)
 
 
 @pytest.mark.parametrize("product", PRODUCTS)
