@@ -5,6 +5,7 @@ import json
 import re
 import sqlite3
 from contextlib import closing
+from datetime import timedelta
 from itertools import pairwise
 from xml.etree import ElementTree as ET
 
@@ -57,6 +58,21 @@ def test_a_file_of_points_opens_with_heights_reference_system_and_properties(get
     assert_allclose(frame["saliency"], made.points.saliency, rtol=1e-7)
     assert frame["typology"].isna().sum() == 15
     assert str(frame["first_view"][0])[:10] == "2023-03-01"
+
+
+def test_a_span_of_time_holds_what_begins_or_ends_at_its_ends(get, connection):
+    dates = run_sql(connection, "select min(first_view) as first, max(last_view) as last from point")
+    edge = dates.fetchone()
+    day_before = edge["first"] - timedelta(days=1)
+    for span, holds in (
+        (f"../{edge['first']}T00:00:00Z", "first"),
+        (f"../{day_before}T23:59:59Z", None),
+        (f"{edge['last']}T00:00:00Z/..", "last"),
+        (f"{edge['last']}T00:00:01Z/..", None),
+    ):
+        found = get(ITEMS, datetime=span, limit=100).json()["features"]
+        assert bool(found) == (holds is not None), span
+        assert {one["properties"][f"{holds}_view"] for one in found} <= {str(edge.get(holds))}, span
 
 
 def test_a_geopackage_of_points_has_styles_that_qgis_finds_by_layer_and_geometry_column(get, tmp_path):
