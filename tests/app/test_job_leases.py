@@ -5,11 +5,11 @@ from concurrent.futures import ThreadPoolExecutor
 from uuid import UUID
 
 import pytest
-from psycopg.errors import UniqueViolation
+from psycopg.errors import LockNotAvailable, UniqueViolation
 
 from app.db import registrations, scenes
-from app.db.engine import Connection, Database
-from app.db.jobs import attempts, jobs
+from app.db.engine import Connection, Database, limit_lock_wait
+from app.db.jobs import attempts, jobs, queue
 from app.db.jobs.attempts import LostJob
 from app.db.jobs.jobs import Job
 from app.storage import Storage
@@ -83,6 +83,64 @@ def test_a_job_given_back_waits_again_without_counting_a_failure(database: Datab
         with database.transaction() as connection:
             attempts.give_back(connection, job.id, attempt)
     assert (state_of(database, job.id).state, state_of(database, job.id).failures) == ("accepted", 0)
+
+
+def test_a_job_given_back_calls_another_worker(database: Database):
+    """The ticket of the worker that stops ends with it."""
+    job = new_job(database)
+    with database.transaction() as connection:
+        run_sql(connection, "update procrastinate_jobs set status = 'doing'")
+    attempt = claimed(database, job.id).attempt
+    with database.transaction() as connection:
+        assert tickets(connection) == 0
+        attempts.give_back(connection, job.id, attempt)
+        assert tickets(connection) == 1
+
+
+def test_each_attempt_that_breaks_off_counts_as_a_failure(database: Database):
+    job = new_job(database)
+    for failures in (1, 2, 3):
+        attempt = claimed(database, job.id).attempt
+        with database.transaction() as connection:
+            attempts.try_again(connection, job.id, attempt, 0.0)
+        assert state_of(database, job.id).failures == failures
+
+
+def test_a_job_that_is_not_due_yet_needs_no_lost_ticket(database: Database):
+    job = new_job(database)
+    attempt = claimed(database, job.id).attempt
+    with database.transaction() as connection:
+        attempts.try_again(connection, job.id, attempt, 3600.0)
+        run_sql(connection, "delete from procrastinate_jobs")
+        run_sql(connection, "update job set updated_at = now() - interval '1 hour'")
+        assert queue.replace_lost_tickets(connection, LEASE_S, None) == 0
+        run_sql(connection, "update job set not_before = now() - interval '1 second'")
+        assert queue.replace_lost_tickets(connection, LEASE_S, None) == 1
+
+
+def test_a_claim_waits_for_another_so_that_it_counts_what_that_one_runs(database: Database):
+    for _ in range(2):
+        new_job(database)
+    with database.transaction() as connection:
+        assert attempts.claim_next(connection, "a", LEASE_S) is not None
+        with database.transaction() as other:
+            limit_lock_wait(other, 0.1)
+            with pytest.raises(LockNotAvailable):
+                attempts.claim_next(other, "b", LEASE_S)
+            other.rollback()
+
+
+def test_a_job_that_has_ended_is_not_dismissed(database: Database):
+    for ending, state in ((attempts.succeed, "successful"), (attempts.fail, "failed")):
+        job = new_job(database)
+        attempt = claimed(database, job.id).attempt
+        with database.transaction() as connection:
+            ending(connection, job.id, attempt, {"title": "x"})
+            assert not jobs.dismiss(connection, job.id)
+        assert state_of(database, job.id).state == state
+    waiting = new_job(database)
+    with database.transaction() as connection:
+        assert jobs.dismiss(connection, waiting.id)
 
 
 def test_a_job_that_outlives_too_many_workers_fails(database: Database):
