@@ -170,6 +170,14 @@ def test_intervals_of_errors_that_groups_share_hold_the_truth():
     assert plain < 0.6 * 300
 
 
+def test_groups_that_share_all_of_their_errors_are_worth_what_their_mean_varies_by():
+    """Of unequal groups, the largest makes most of the variance of the mean."""
+    group = np.repeat(np.arange(31), [90] + [1] * 30)
+    error = np.random.default_rng(3).normal(0.0, 1.0, (31, 1))[group]
+    share_of_mean = np.bincount(group) / len(group)
+    assert effective_number(error, group) == pytest.approx(1.0 / (share_of_mean**2).sum(), rel=1e-9)
+
+
 def test_independent_errors_are_worth_their_number():
     rng = np.random.default_rng(16)
     worth = [effective_number(rng.normal(size=(500, 1)), np.arange(500) % 10) for _ in range(50)]
