@@ -75,6 +75,16 @@ def test_a_span_of_time_holds_what_begins_or_ends_at_its_ends(get, connection):
         assert {one["properties"][f"{holds}_view"] for one in found} <= {str(edge.get(holds))}, span
 
 
+def test_the_next_page_is_for_the_kind_of_caller_who_asked_for_the_first(made, client, bearer):
+    """A token tells where a page ends and how many features there are, to administrators of all."""
+    admin, reader = bearer("admin"), bearer("read")
+    for own, other in ((admin, reader), (reader, admin)):
+        page = client.get(f"{ITEMS}?limit=10", headers=own).json()
+        (following,) = (link["href"] for link in page["links"] if link["rel"] == "next")
+        assert client.get(following, headers=own).status_code == 200
+        assert client.get(following, headers=other).status_code == 400
+
+
 def test_a_geopackage_of_points_has_styles_that_qgis_finds_by_layer_and_geometry_column(get, tmp_path):
     path = tmp_path / "points.gpkg"
     path.write_bytes(get(ITEMS, f="gpkg").content)
