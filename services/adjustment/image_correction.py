@@ -99,7 +99,7 @@ class SceneAdjustment:
         point_sigma_px: (2,) contribution of the points' own accuracy to the active residuals, one
             standard deviation of line and sample.
         components: of the displacement beyond the affine correction that residuals show.
-        bends: components of it that the points leave open, where they do not reach.
+        left_open: components of it that the points leave open, where they do not reach: bends, seams.
         structures: what the residuals of the correction still depend on, by family; none where it was
             not tested.
         moved: ground that moved, of which no measure is active; None where none is seen.
@@ -120,7 +120,7 @@ class SceneAdjustment:
     sigma0: float
     point_sigma_px: Array
     components: tuple[Component, ...] = ()
-    bends: tuple[Component, ...] = ()
+    left_open: tuple[Component, ...] = ()
     structures: tuple[Structure, ...] = ()
     moved: MovedGround | None = None
 
@@ -251,9 +251,9 @@ def adjust_scene(
         )
     )
     agreeing_measures = AgreeingMeasures(measured, fit, declared, active, shared, limit)
-    bent = _bends(agreeing_measures, expected, components, options, like)
-    if components or bent:
-        solution = agreeing_measures.displaced(expected, (*components, *bent))
+    left_open = _left_open(agreeing_measures, expected, components, options, like)
+    if components or left_open:
+        solution = agreeing_measures.displaced(expected, (*components, *left_open))
     else:
         solution = agreeing_measures.affine(free, slope_px)
     displacement, covariance = solution.displacement, solution.covariance
@@ -296,7 +296,7 @@ def adjust_scene(
         sigma0=solution.sigma0,
         point_sigma_px=np.sqrt(of_points[active].mean(axis=0)),
         components=components,
-        bends=bent,
+        left_open=left_open,
         structures=tested if like else (*tested, short.structure),
     )
 
@@ -327,20 +327,20 @@ def _motion(
     )
 
 
-def _bends(
+def _left_open(
     measures: AgreeingMeasures,
     expected: Array,
     components: tuple[Component, ...],
     options: AdjustmentOptions,
     like: SceneAdjustment | None,
 ) -> tuple[Component, ...]:
-    """The bends that the measures leave open, of a scanned image whose motion is followed."""
+    """What the measures leave open, of a scanned image whose motion is followed."""
     if like:
-        return like.bends
+        return like.left_open
     wanted = options.profile and options.bends and options.order is None
     if not wanted or not measures.measured.scanned:
         return ()
-    return measures.bends(expected, components)
+    return measures.left_open(expected, components)
 
 
 def _beside(

@@ -13,6 +13,7 @@ from services.adjustment.displacement_solution import joined, solve_displacement
 from services.adjustment.placed_measures import PlacedMeasures
 from services.adjustment.shared_errors import SharedErrors
 from services.adjustment.structure import Residuals
+from services.adjustment.unseen_seams import unseen_seams
 from services.sensors.displacement import DisplacementGrid
 from services.types import Array, BoolArray
 
@@ -87,10 +88,13 @@ class AgreeingMeasures:
             float(np.sqrt(chi2 / _kept_variance(self.tolerance))),
         )
 
-    def bends(self, expected: Array, components: Sequence[Component]) -> tuple[Component, ...]:
-        """The bends that are left open beside some components."""
-        moving = self._as_shown(components)
-        return bends(with_components(self._told(), moving), expected, self.measured.shape)
+    def left_open(self, expected: Array, components: Sequence[Component]) -> tuple[Component, ...]:
+        """What the measures leave open beside some components: bends, and seams beyond the points."""
+        moving, told, shape = self._as_shown(components), self._told(), self.measured.shape
+        return (
+            *bends(with_components(told, moving), expected, shape),
+            *unseen_seams(components, told.line_sample[:, 1], shape[1]),
+        )
 
     def _told(self) -> Residuals:
         """The residuals with all their errors."""

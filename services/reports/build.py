@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from services.adjustment.affine_fit import Order
-from services.adjustment.displacement_components import Component
+from services.adjustment.displacement_components import BENDS, Component
 from services.adjustment.image_correction import SceneAdjustment
 from services.imagery.scene import Scene, scene_footprint, scene_gsd_m
 from services.quality.criteria import VERDICT_EXPLANATIONS, verdict_scope
@@ -162,8 +162,10 @@ def correction_in_words(adjustment: SceneAdjustment, gsd_m: float) -> tuple[str,
     if displacement is not None:
         line, sample = np.ptp(displacement.displacement_px, axis=(0, 1))
         kinds = [_component_in_words(one, adjustment) for one in adjustment.components]
-        if adjustment.bends:
+        if any(one.kind in BENDS for one in adjustment.left_open):
             kinds.append("bends of the image, which points on a part of it leave open")
+        if any(one.is_seam for one in adjustment.left_open):
+            kinds.append("seams beyond the points, as many as between them")
         sentences.append(
             f"beyond the affine correction, {', '.join(kinds)}: within {line:.2f} px in line, "
             f"{sample:.2f} px in sample"

@@ -67,7 +67,7 @@ def test_straight_images_with_points_on_a_part_stay_usable() -> None:
 @pytest.mark.monte_carlo
 def test_points_all_over_a_straight_image_leave_its_correction_as_good_as_an_affine_one() -> None:
     trials = [trial(still, seed, count=100) for seed in range(24)]
-    bent = [one for one in trials if one.adjustment.bends]
+    bent = [one for one in trials if one.adjustment.left_open]
     assert len(bent) < 12
     assert 0.7 < np.mean([one.normalised for one in trials]) < 1.2
     for one in bent:
@@ -80,8 +80,8 @@ def test_bends_are_left_open_in_pixels_whatever_the_sigmas_state() -> None:
     observations, _ = draw(still, np.random.default_rng(2), count=40, reach=ON_SAMPLES)
     too_small = replace(observations, sigma_px=observations.sigma_px / 4.0)
     honest, understated = (adjust_scene(FlatModel(), SHAPE, one) for one in (observations, too_small))
-    assert honest.bends
-    assert understated.bends
+    assert honest.left_open
+    assert understated.left_open
     assert corners_px(understated)[:, 1] == pytest.approx(corners_px(honest)[:, 1], rel=0.2)
 
 
@@ -90,14 +90,14 @@ def test_a_repetition_leaves_open_the_bends_that_the_whole_does() -> None:
     whole = adjust_scene(FlatModel(), SHAPE, observations)
     part = replace(observations, usable=np.arange(40) % 5 > 0)
     repeated = adjust_scene(FlatModel(), SHAPE, part, like=whole)
-    assert whole.bends
+    assert whole.left_open
     assert (corners_px(repeated)[:, 1] > 0.9 * corners_px(whole)[:, 1]).all()
 
 
 def test_no_bend_is_left_open_where_the_user_gives_an_order() -> None:
     observations, _ = draw(still, np.random.default_rng(2), count=40, reach=ON_SAMPLES)
     given = adjust_scene(FlatModel(), SHAPE, observations, AdjustmentOptions(order="affine"))
-    assert given.bends == ()
+    assert given.left_open == ()
     assert given.correction.displacement is None
 
 
