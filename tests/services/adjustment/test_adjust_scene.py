@@ -473,7 +473,7 @@ def test_a_repetition_expects_drifts_as_large_as_the_whole_does() -> None:
     corner = np.zeros((1, 2))
 
     def repeated_std_px(slope_px: float) -> float:
-        like = replace(alone, slope_px=slope_px, bends=())
+        like = replace(alone, slope_px=slope_px, left_open=())
         result = adjust_scene(FlatModel(), SHAPE, observations, like=like)
         return float(np.sqrt(result.covariance_at(corner)[0, 0, 0]))
 
