@@ -155,6 +155,7 @@ def missed_criterion(
     reason: np.ndarray,
     size: int,
     *,
+    misfit_px: Array | None = None,
     counts: BoolArray | None = None,
 ) -> Criterion:
     """The criterion on lines, or samples, whose points do not agree, where those of others do.
@@ -168,6 +169,8 @@ def missed_criterion(
         active: (n,) those that the adjustment uses.
         reason: (n,) why others are not.
         size: lines or samples of the image.
+        misfit_px: (n, 2) from where the scene places the points to where they were found; without, the
+            borders are not looked at by themselves.
         counts: (n,) points that count beside the active ones: neither cut by a break of the image nor
             where the scene says, as far as its accuracy goes; all when None.
     """
@@ -176,8 +179,10 @@ def missed_criterion(
     tried = active | np.isin(reason, disagree)
     if counts is not None:
         tried &= counts | active
-    found = tried & (active | (reason == "deactivated"))
-    missed = missed_along(position, active, tried) | missed_at_borders(position, active, found)
+    missed = missed_along(position, active, tried)
+    if misfit_px is not None:
+        found = tried & (active | (reason == "deactivated"))
+        missed |= missed_at_borders(position, active, found, misfit_px)
     if not missed.any():
         return at_most(name, 0.0, 0.0, "good")
     beside = tried & ~missed

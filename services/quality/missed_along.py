@@ -45,18 +45,22 @@ def missed_along(position: Array, agrees: BoolArray, tried: BoolArray) -> BoolAr
     return missed
 
 
-def missed_at_borders(position: Array, agrees: BoolArray, found: BoolArray) -> BoolArray:
+def missed_at_borders(
+    position: Array, agrees: BoolArray, found: BoolArray, misfit_px: Array
+) -> BoolArray:
     """Points (n,) between a border and the first that agrees, where chance leaves out fewer.
 
     The last part of an image that was put together, or that swings, has no points on its other side:
     what is left out there is no gap, and the correction goes on beyond the others as if it held. The
     chance that the points of a border are all among those left out is that of drawing them without
-    return, times the four borders of an image, at most 0.01.
+    return, times the four borders of an image, at most 0.01. They are displaced alike: false matches
+    are not.
 
     Args:
         position: (n,) line or sample where the points are expected.
         agrees: (n,) with the scene.
         found: (n,) those that the scene shows somewhere.
+        misfit_px: (n, 2) from where the scene places the points to where they were found.
     """
     missed = np.zeros(len(position), dtype=bool)
     rows = np.flatnonzero(found)
@@ -69,7 +73,10 @@ def missed_at_borders(position: Array, agrees: BoolArray, found: BoolArray) -> B
         run = int(np.argmax(agrees[ordered]))
         drawn = np.arange(run)
         chance = _BORDERS * float(np.prod((n_left_out - drawn) / (n - drawn)))
-        if run >= _FEWEST_AT_BORDER and chance <= _MAX_CHANCE:
+        if run < _FEWEST_AT_BORDER or chance > _MAX_CHANCE:
+            continue
+        together = misfit_px[ordered[:run]].mean(axis=0)
+        if np.hypot(*(misfit_px[ordered[:run]] - together).T).max() < np.hypot(*together):
             missed[ordered[:run]] = True
     return missed
 

@@ -357,7 +357,8 @@ def _of_fit(scene: AdjustedScene, predicted_px: float) -> list[Criterion]:
     if displaced is not None:
         structures = [displaced if one.name == displaced.name else one for one in structures]
     # A point that lies within the stated accuracy says nothing against it, however well others agree.
-    off = ~(np.hypot(*(measures.line_sample - expected).T) <= predicted_px)
+    misfit_px = measures.line_sample - expected
+    off = ~(np.hypot(*misfit_px.T) <= predicted_px)
     return [
         *structures,
         *_behind_breaks(scene),
@@ -367,10 +368,17 @@ def _of_fit(scene: AdjustedScene, predicted_px: float) -> list[Criterion]:
             measures.active,
             measures.reason,
             scene.shape[0],
+            misfit_px=misfit_px,
             counts=off & _whole(scene, expected),
         ),
         missed_criterion(
-            "samples", expected[:, 1], measures.active, measures.reason, scene.shape[1], counts=off
+            "samples",
+            expected[:, 1],
+            measures.active,
+            measures.reason,
+            scene.shape[1],
+            misfit_px=misfit_px,
+            counts=off,
         ),
         elsewhere_criterion(scene.elsewhere, expected, measures.active, scene.shape),
     ]

@@ -7,6 +7,7 @@ from services.quality.lack_of_fit import missed_criterion
 from services.quality.missed_along import missed_along, missed_at_borders
 
 LINES = 2000
+AWAY_PX = np.array([2.0, -1.0])
 
 
 def places(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -136,7 +137,9 @@ def test_points_left_out_at_random_accuse_no_border(share: float) -> None:
     accused = 0
     for _ in range(4000):
         line = places(rng, 70)
-        accused += missed_at_borders(line, rng.random(70) >= share, np.ones(70, dtype=bool)).any()
+        accused += missed_at_borders(
+            line, rng.random(70) >= share, np.ones(70, dtype=bool), np.tile(AWAY_PX, (70, 1))
+        ).any()
     assert accused <= 20, "half of one in a hundred: the other half is that of the samples"
 
 
@@ -149,8 +152,11 @@ def test_few_points_of_the_other_image_at_a_border_accuse_its_lines() -> None:
         reason[5:70] = "low_score"  # hidden here and there: they say nothing of either part
         reason[rng.choice(np.arange(70, 135), 8, replace=False)] = "deactivated"
         active = reason == ""
-        criterion = missed_criterion("lines", line, active, reason.astype(str), LINES)
-        turned = missed_criterion("lines", LINES - line, active, reason.astype(str), LINES)
+        misfit_px = np.where(active[:, None], 0.0, AWAY_PX) + rng.normal(0.0, 0.3, (135, 2))
+        criterion, turned = (
+            missed_criterion("lines", at, active, reason.astype(str), LINES, misfit_px=misfit_px)
+            for at in (line, LINES - line)
+        )
         assert (criterion.met, criterion.needed_for) == (False, "usable")
         assert 12.0 <= criterion.value <= 25.0
         assert turned.value == pytest.approx(criterion.value)
@@ -158,9 +164,20 @@ def test_few_points_of_the_other_image_at_a_border_accuse_its_lines() -> None:
 
 def test_points_that_are_not_found_or_two_that_disagree_accuse_no_border() -> None:
     line = np.linspace(0.0, LINES - 1.0, 100)
-    all_found = np.ones(100, dtype=bool)
+    all_found, away = np.ones(100, dtype=bool), np.tile(AWAY_PX, (100, 1))
     agrees = np.arange(100) >= 6
-    assert not missed_at_borders(line, agrees, agrees).any()
-    assert not missed_at_borders(line, np.arange(100) >= 2, all_found).any()
+    assert not missed_at_borders(line, agrees, agrees, away).any()
+    assert not missed_at_borders(line, np.arange(100) >= 2, all_found, away).any()
     for others in (np.arange(100) >= 3, np.arange(100) < 97):
-        np.testing.assert_array_equal(missed_at_borders(line, others, all_found), ~others)
+        np.testing.assert_array_equal(missed_at_borders(line, others, all_found, away), ~others)
+
+
+def test_false_matches_at_a_border_accuse_it_less_than_points_that_are_displaced_alike() -> None:
+    line = np.linspace(0.0, LINES - 1.0, 100)
+    all_found, others = np.ones(100, dtype=bool), np.arange(100) >= 4
+    rng = np.random.default_rng(18)
+    accused = [
+        missed_at_borders(line, others, all_found, rng.uniform(-8.0, 8.0, (100, 2))).any()
+        for _ in range(400)
+    ]
+    assert np.mean(accused) < 0.1
