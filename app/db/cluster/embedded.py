@@ -37,7 +37,7 @@ DATABASE = "amers"
 CREATE_DATABASE = "create database amers"
 SOCKET_NAME = ".s.PGSQL.5432"
 LONGEST_SOCKET_PATH = 107
-START_SECONDS = 120.0
+START_SECONDS, STOP_SECONDS = 120.0, 60.0
 LEAVING_SECONDS = 10.0
 LOCK_SECONDS = 20.0
 
@@ -186,6 +186,18 @@ class Cluster:
             f"PostgreSQL in {self.folder} neither starts nor stops: see {self.folder / 'server.log'}"
         )
 
+    def _has_ended(self) -> bool:
+        """Whether the server, which was told to stop, removes its lock file: the last thing it does.
+
+        pg_ctl would wait for the same, but looks ten times a second only.
+        """
+        deadline = time.monotonic() + STOP_SECONDS
+        while (self.data / "postmaster.pid").exists():
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.005)
+        return True
+
     @contextmanager
     def _turn(self) -> Iterator[None]:
         turn = os.open(self.folder / "turn", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -323,8 +335,9 @@ class Cluster:
             return
         pg_ctl = str(find_binaries(int((self.data / "PG_VERSION").read_text())).folder / "pg_ctl")
         for mode in ("fast", "immediate"):
-            command = [pg_ctl, "stop", "--wait", "--silent", "--mode", mode, "--pgdata", str(self.data)]
-            if run_as(user, command).returncode == 0 or not self.is_running():
+            command = [pg_ctl, "stop", "--no-wait", "--silent", "--mode", mode]
+            told = run_as(user, [*command, "--pgdata", str(self.data)]).returncode == 0
+            if (told and self._has_ended()) or not self.is_running():
                 break
         else:
             raise ServerFailure(f"PostgreSQL in {self.folder} does not stop")
