@@ -204,7 +204,8 @@ def _nodes(
         spacing = min(steps, default=high - low)
         fewest = _NODES_OF_BROKEN if any(one.kind == "break" for one in along) else _FEWEST_NODES
         if any(one.is_seam for one in along):
-            fewest = most  # as of broken images: beyond the points seams leave pixels open, too
+            # Beyond the points, seams leave pixels open: see `_NODES_OF_BROKEN`.
+            fewest = most
         count = int(np.clip((high - low) / spacing, fewest, most)) if along else 2
         both.append(np.unique(np.concatenate([np.linspace(low, high, count), *gaps])))
     return both[0], both[1]

@@ -77,7 +77,7 @@ def browser() -> Iterator[Browser]:
     """Debian's Chromium without a network beyond this machine."""
     chromium = shutil.which("chromium")
     if chromium is None:
-        pytest.skip("there is no chromium: the page cannot be looked at (make test installs it)")
+        pytest.skip("there is no chromium: the page cannot be looked at: run `make chromium`")
     if not BUILT.is_file():
         pytest.skip("the page is not built: run `make page`")
     ARTEFACTS.mkdir(exist_ok=True)
