@@ -6,7 +6,7 @@ import httpx
 import numpy as np
 import pytest
 import rasterio
-from playwright.sync_api import Locator, Page, expect
+from playwright.sync_api import Locator, Page, Route, expect
 
 from app.db import engine
 from app.db.cluster.embedded import DATABASE
@@ -166,12 +166,17 @@ def test_a_proposed_point_is_suspended_with_a_reason_and_reinstated(visit, admin
     assert served(api) == points_of_the_block
 
 
+def make_changes(api: httpx.Client, name: str, headers: dict[str, str] | None = None) -> None:
+    """Make as many tokens as the page lists changes at once."""
+    for number in range(page_of_changes):
+        body = {"name": f"{name} {number}", "scopes": ["read"]}
+        api.post("/tokens", json=body, headers=headers).raise_for_status()
+
+
 def test_the_audit_trail_is_read_page_by_page_and_filtered(visit, administrator, api):
     body = {"name": "Bob", "scopes": ["admin"]}
     bob = {"Authorization": f"Bearer {api.post('/tokens', json=body).json()['secret']}"}
-    for number in range(page_of_changes):
-        body = {"name": f"program {number}", "scopes": ["read"]}
-        api.post("/tokens", json=body, headers=bob).raise_for_status()
+    make_changes(api, "program", bob)
     api.delete("/tokens/program 7", headers=bob).raise_for_status()
     page = visit("#/admin/audit", administrator)
     changes = page.get_by_role("list", name="Changes").get_by_role("listitem")
@@ -199,6 +204,53 @@ def test_the_audit_trail_is_read_page_by_page_and_filtered(visit, administrator,
     page.get_by_label("Which").fill("nothing")
     page.get_by_role("button", name="Show").click()
     expect(page.get_by_text("No changes.")).to_be_visible()
+
+
+def hold_older_pages(page: Page) -> list[Route]:
+    """Keep requests for older changes unanswered; they are collected here."""
+    held: list[Route] = []
+    page.route(lambda url: "/audit?" in url and "before=" in url, lambda route: held.append(route))
+    return held
+
+
+def test_a_page_of_an_earlier_list_that_arrives_late_is_not_added(visit, administrator, api):
+    make_changes(api, "reader")
+    page = visit("#/admin/audit", administrator)
+    changes = page.get_by_role("list", name="Changes").get_by_role("listitem")
+    older = page.get_by_role("button", name="Older changes")
+    expect(changes).to_have_count(page_of_changes)
+
+    late = hold_older_pages(page)
+    older.click()
+    page.get_by_label("Which").fill("flat@1")
+    page.get_by_role("button", name="Show").click()
+    expect(page.get_by_text("These are all changes.")).to_be_visible()
+    of_the_block = changes.count()
+    assert len(late) == 1
+    with page.expect_response(lambda reply: "before=" in reply.url):
+        late[0].continue_()
+    page.wait_for_load_state("networkidle")
+    expect(changes).to_have_count(of_the_block)
+    expect(older).to_be_hidden()
+
+
+def test_an_older_page_is_asked_for_once_and_again_when_it_failed(visit, administrator, api):
+    make_changes(api, "client")
+    page = visit("#/admin/audit", administrator, refused=503)
+    changes = page.get_by_role("list", name="Changes").get_by_role("listitem")
+    expect(changes).to_have_count(page_of_changes)
+    held = hold_older_pages(page)
+    older = page.get_by_role("button", name="Older changes")
+    older.dblclick()
+    page.wait_for_timeout(200)
+    assert len(held) == 1
+    held[0].fulfill(status=503, json={"detail": "The database is away."})
+    expect(page.get_by_text("The database is away.")).to_be_visible()
+    page.unroute_all()
+    older.click()
+    expect(changes.nth(page_of_changes)).to_be_visible()
+    shown = changes.all_inner_texts()
+    assert len(set(shown)) == len(shown)
 
 
 def test_the_status_names_workers_storage_and_owners(visit, administrator, api):

@@ -14,9 +14,10 @@ export const showAudit: ShowPart = async ({ content, signal }) => {
   const subject = h("input", { id: "audit-subject", autocomplete: "off", placeholder: "all" });
   const actor = h("input", { id: "audit-actor", autocomplete: "off", placeholder: "everybody" });
   const changes = h("ul", { class: "list story", "aria-label": "Changes" });
-  const older = h("button", { type: "button", onclick: () => void show(next!) }, "Older changes");
+  const older = h("button", { type: "button", onclick: () => void (next && show(next)) }, "Older changes");
   const end = h("p", { class: "quiet", tabindex: -1 });
-  let next: string | undefined;
+  let next: string | undefined; // the older page, unless it is awaited
+  let listing = 0;
   fill(
     content,
     h(
@@ -34,11 +35,18 @@ export const showAudit: ShowPart = async ({ content, signal }) => {
     h("p", {}, older),
     end,
   );
-  await show(query());
+  await list();
 
   async function filter(event: Event): Promise<void> {
     event.preventDefault();
+    await list();
+  }
+
+  /** List the changes that are asked for; pages of the list before it that still arrive are dropped. */
+  async function list(): Promise<void> {
+    listing++;
     changes.replaceChildren();
+    older.hidden = true;
     await show(query());
   }
 
@@ -49,16 +57,23 @@ export const showAudit: ShowPart = async ({ content, signal }) => {
 
   /** Add the changes of a page; where it is the last one, the focus goes from the button to what says so. */
   async function show(page: string): Promise<void> {
+    const mine = listing;
+    next = undefined;
+    end.textContent = "";
     try {
       const { changes: more, links } = await get<ChangeRecords>(address(page), signal);
-      const asked = document.activeElement === older;
+      if (mine !== listing) return;
+      const pressed = document.activeElement === older;
       next = links.find(({ rel }) => rel === "next")?.href;
       changes.append(...more.map(row));
       older.hidden = next === undefined;
-      end.textContent = next ? "" : changes.children.length ? "These are all changes." : "No changes.";
-      if (asked && !next) end.focus();
+      if (!next) end.textContent = changes.children.length ? "These are all changes." : "No changes.";
+      if (pressed && !next) end.focus();
     } catch (error) {
-      if (!signal.aborted) fill(end, problem(error));
+      if (signal.aborted || mine !== listing) return;
+      next = page;
+      older.hidden = false;
+      fill(end, problem(error));
     }
   }
 };
