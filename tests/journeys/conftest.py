@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any, Literal
 from uuid import uuid4
 
+import numpy as np
 import pytest
+import rasterio
 from playwright.sync_api import (
     Browser,
     ConsoleMessage,
@@ -18,7 +20,7 @@ from playwright.sync_api import (
 )
 
 from app.db.cluster.embedded import Cluster
-from tests.app.flat_world import FlatWorld, make_flat_world
+from tests.app.flat_world import CENTRE, GROUND_H, FlatWorld, make_flat_world
 from tests.command_line import amers_here
 from tests.journeys.map_page import ARTEFACTS, BUILT, DESKTOP, is_error, patience_ms
 from tests.service_process import Service, installed_at, until
@@ -149,3 +151,15 @@ def visit(browser: Browser, service: Service, world: FlatWorld) -> Iterator[Visi
     assert requested_urls
     assert [url for url in requested_urls if not url.startswith(inside)] == []
     assert errors == []
+
+
+@pytest.fixture(scope="module")
+def ground(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Flat ground below the scene."""
+    path = tmp_path_factory.mktemp("ground") / "ground.tif"
+    west, north = CENTRE + [-0.01, 0.01]
+    profile = {"driver": "GTiff", "width": 40, "height": 40, "count": 1, "dtype": "float32"}
+    grid = rasterio.transform.from_origin(west, north, 0.0005, 0.0005)
+    with rasterio.open(path, "w", **profile, crs="EPSG:4326", transform=grid) as file:
+        file.write(np.full((40, 40), GROUND_H, dtype=np.float32), 1)
+    return path

@@ -2,7 +2,11 @@
 
 from pathlib import Path
 
-from playwright.sync_api import ConsoleMessage, Page, ViewportSize, expect
+import httpx
+from playwright.sync_api import ConsoleMessage, Page, Route, ViewportSize, expect
+
+from tests.app.flat_world import FlatWorld
+from tests.service_process import Service, until
 
 ROOT = Path(__file__).parents[2]
 BUILT = ROOT / "app" / "web" / "built" / "index.html"
@@ -69,3 +73,28 @@ def keep_whole_page(page: Page, name: str) -> None:
         of_page = {"x": 0, "y": top, "width": width, "height": min(tallest_picture_px, height - top)}
         path = ARTEFACTS / (f"{name}.png" if part == 1 else f"{name}-{part}.png")
         page.screenshot(path=path, full_page=True, clip=of_page)
+
+
+def registered(service: Service, secret: str, world: FlatWorld, name: str = "drawn-on.tif") -> str:
+    """The job that registered the scene of the world."""
+    headers = {"Authorization": f"Bearer {secret}"}
+    with httpx.Client(base_url=service.url, headers=headers, timeout=30.0) as client:
+        sent = client.post(f"/scenes?name={name}", content=world.tagged.read_bytes())
+        inputs = {"inputs": {"scene": sent.raise_for_status().json()["id"]}}
+        asked = client.post("/processes/register-scene/execution", json=inputs)
+        job: str = asked.raise_for_status().json()["jobID"]
+        assert until(lambda: client.get(f"/jobs/{job}").json()["status"] == "successful")
+    return job
+
+
+def hold(page: Page, part: str) -> list[Route]:
+    """Keep the next request for an address with some part unanswered; it is put here."""
+    held: list[Route] = []
+    page.route(lambda url: part in url, lambda route: held.append(route), times=1)
+    return held
+
+
+def until_held(page: Page, held: list[Route]) -> Route:
+    """The request that is kept, once the page has sent it."""
+    assert until(lambda: bool(page.wait_for_timeout(poll_ms) or held))
+    return held[0]

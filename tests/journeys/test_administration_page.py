@@ -6,12 +6,12 @@ import httpx
 import numpy as np
 import pytest
 import rasterio
-from playwright.sync_api import Locator, Page, Route, expect
+from playwright.sync_api import Locator, Page, expect
 
 from app.db import engine
 from app.db.cluster.embedded import DATABASE
 from tests.factories import make_block
-from tests.journeys.map_page import ARTEFACTS, PHONE, WIDE, assert_readable, tab_to
+from tests.journeys.map_page import ARTEFACTS, PHONE, WIDE, assert_readable, hold, tab_to, until_held
 from tests.service_process import Service
 from tests.statements import run_sql
 
@@ -206,13 +206,6 @@ def test_the_audit_trail_is_read_page_by_page_and_filtered(visit, administrator,
     expect(page.get_by_text("No changes.")).to_be_visible()
 
 
-def hold_older_pages(page: Page) -> list[Route]:
-    """Keep requests for older changes unanswered; they are collected here."""
-    held: list[Route] = []
-    page.route(lambda url: "/audit?" in url and "before=" in url, lambda route: held.append(route))
-    return held
-
-
 def test_a_page_of_an_earlier_list_that_arrives_late_is_not_added(visit, administrator, api):
     make_changes(api, "reader")
     page = visit("#/admin/audit", administrator)
@@ -220,13 +213,12 @@ def test_a_page_of_an_earlier_list_that_arrives_late_is_not_added(visit, adminis
     older = page.get_by_role("button", name="Older changes")
     expect(changes).to_have_count(page_of_changes)
 
-    late = hold_older_pages(page)
+    late = hold(page, "/audit?limit=50&before=")
     older.click()
     page.get_by_label("Which").fill("flat@1")
     page.get_by_role("button", name="Show").click()
     expect(page.get_by_text("These are all changes.")).to_be_visible()
     of_the_block = changes.count()
-    assert len(late) == 1
     with page.expect_response(lambda reply: "before=" in reply.url):
         late[0].continue_()
     page.wait_for_load_state("networkidle")
@@ -239,14 +231,12 @@ def test_an_older_page_is_asked_for_once_and_again_when_it_failed(visit, adminis
     page = visit("#/admin/audit", administrator, refused=503)
     changes = page.get_by_role("list", name="Changes").get_by_role("listitem")
     expect(changes).to_have_count(page_of_changes)
-    held = hold_older_pages(page)
+    held = hold(page, "/audit?limit=50&before=")
     older = page.get_by_role("button", name="Older changes")
     older.dblclick()
-    page.wait_for_timeout(200)
-    assert len(held) == 1
-    held[0].fulfill(status=503, json={"detail": "The database is away."})
+    until_held(page, held).fulfill(status=503, json={"detail": "The database is away."})
     expect(page.get_by_text("The database is away.")).to_be_visible()
-    page.unroute_all()
+    expect(changes).to_have_count(page_of_changes)
     older.click()
     expect(changes.nth(page_of_changes)).to_be_visible()
     shown = changes.all_inner_texts()

@@ -10,13 +10,12 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-import rasterio
 import shapely
 from matplotlib.image import imread
 from playwright.sync_api import Locator, Page, Request, Route, expect
 
 from services.geodesy import metres_per_degree
-from tests.app.flat_world import CENTRE, GROUND_H, GSD_M, FlatWorld
+from tests.app.flat_world import CENTRE, GROUND_H, GSD_M
 from tests.factories import make_block
 from tests.journeys.map_page import (
     ARTEFACTS,
@@ -26,6 +25,7 @@ from tests.journeys.map_page import (
     WIDE,
     assert_readable,
     poll_ms,
+    registered,
     tab_to,
     until_drawn,
 )
@@ -181,18 +181,6 @@ def test_what_is_drawn_on_the_raw_image_appears_on_the_map_and_returns(
     page.screenshot(path=ARTEFACTS / "draw-phone.png")
 
 
-def registered(service: Service, secret: str, world: FlatWorld, name: str = "drawn-on.tif") -> str:
-    """The job that registered the scene of the world."""
-    headers = {"Authorization": f"Bearer {secret}"}
-    with httpx.Client(base_url=service.url, headers=headers, timeout=30.0) as client:
-        sent = client.post(f"/scenes?name={name}", content=world.tagged.read_bytes())
-        inputs = {"inputs": {"scene": sent.raise_for_status().json()["id"]}}
-        asked = client.post("/processes/register-scene/execution", json=inputs)
-        job: str = asked.raise_for_status().json()["jobID"]
-        assert until(lambda: client.get(f"/jobs/{job}").json()["status"] == "successful")
-    return job
-
-
 def test_an_image_is_compared_on_the_map_before_and_after_its_registration(
     visit, world, secret, service
 ):
@@ -297,18 +285,6 @@ def test_a_scene_tells_its_state_and_is_registered_again_with_other_options(
         expect(page.get_by_role("button", name="Register", exact=True)).to_be_visible()
         page.goto(f"{service.url}/map#/scene/{inputs['scene']}")
         expect(page.locator(".story li")).to_have_count(2)
-
-
-@pytest.fixture(scope="module")
-def ground(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Flat ground below the scene."""
-    path = tmp_path_factory.mktemp("ground") / "ground.tif"
-    west, north = CENTRE + [-0.01, 0.01]
-    profile = {"driver": "GTiff", "width": 40, "height": 40, "count": 1, "dtype": "float32"}
-    grid = rasterio.transform.from_origin(west, north, 0.0005, 0.0005)
-    with rasterio.open(path, "w", **profile, crs="EPSG:4326", transform=grid) as file:
-        file.write(np.full((40, 40), GROUND_H, dtype=np.float32), 1)
-    return path
 
 
 def read_download(page: Page, name: str) -> dict:

@@ -179,12 +179,14 @@ class Drawing {
   private async locate(event: Event): Promise<void> {
     event.preventDefault();
     await this.working(this.send, this.outcome, async (report) => {
-      const drawn = collection(this.shapes);
+      const located = this.shapes;
+      const drawn = collection(located);
       const inputs = await this.inputs(file(DRAWN, drawn));
       const job = await run("correct-vectors", { ...inputs, options: { pixels: "corner" } }, this.place.signal, report);
       const results = await this.results(job);
       const onMap = await get<FeatureCollection>(results["vectors.geojson"]!.href, this.place.signal);
-      this.accurate = onMap.features.map(({ properties }) => properties as Accurate);
+      // Accuracies belong to shapes by their order: to none of those drawn or removed meanwhile.
+      if (this.shapes === located) this.accurate = onMap.features.map(({ properties }) => properties as Accurate);
       const features = onMap.features.map((feature): Feature => ({ ...feature, properties: { ...feature.properties, status: "active" } }));
       await this.place.atlas.show("vectors", features);
       this.place.atlas.fit({ type: "FeatureCollection", features }, CLOSEST_ZOOM);

@@ -116,9 +116,8 @@ async function showResults(place: Place, job: StatusInfo, heading: HTMLElement, 
   const { features, exaggeration } = residualVectors(points);
   heading.textContent = report.scene.name;
   fill(body, ...summary(report, exaggeration), drawingLink(job), imageOnMap(place, job, report), ...criteria(report), await downloads(results, signal));
-  await atlas.show("scenes", [{ type: "Feature", properties: {}, geometry: footprint }]);
-  await atlas.show("vectors", features);
   signal.addEventListener("abort", () => void atlas.show("vectors", []));
+  await Promise.all([atlas.show("scenes", [{ type: "Feature", properties: {}, geometry: footprint }]), atlas.show("vectors", features)]);
   atlas.fit(footprint, 17);
 }
 

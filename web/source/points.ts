@@ -30,18 +30,21 @@ export const showPoints: ShowView = async ({ panel, atlas, signal }) => {
   let moves = 0;
   atlas.whileMoving(() => {
     const move = ++moves;
-    setTimeout(() => move === moves && !signal.aborted && void refresh(), move === 1 ? 0 : SETTLED_MS);
+    const stays = () => move === moves && !signal.aborted;
+    setTimeout(() => stays() && void refresh(stays), move === 1 ? 0 : SETTLED_MS);
   }, signal);
 
-  async function refresh(): Promise<void> {
+  /** List the points in view, if the map stays there until they arrive. */
+  async function refresh(stays: () => boolean): Promise<void> {
     try {
       const page = await get<FeaturePage<PointOfPage>>(`collections/points/items?bbox=${atlas.bounds().join(",")}&limit=${LISTED}`, signal);
+      if (!stays()) return;
       const total = page.numberMatched;
       count.textContent = total > page.features.length ? `${plural(total, "point")}, the first ${page.features.length}:` : plural(total, "point");
       list.replaceChildren(...page.features.map(row));
       nothing.hidden = total > 0;
     } catch (error) {
-      if (!signal.aborted) count.replaceChildren(problem(error));
+      if (stays()) count.replaceChildren(problem(error));
     }
   }
 };
@@ -77,8 +80,8 @@ export const showPoint: ShowView = async ({ panel, atlas, signal }, id) => {
     chips,
   );
   atlas.fit(point.geometry, 13);
-  await atlas.choose(Number(id));
   signal.addEventListener("abort", () => void atlas.choose(null));
+  await atlas.choose(Number(id));
   await Promise.all(properties.views.map((view, number) => show(chips, id, view, number, signal)));
 };
 
