@@ -62,7 +62,7 @@ MODULES = (
     _of_service(
         "auth",
         "auth.py api/access.py api/credentials.py api/deps.py",
-        "basic_authentication sign_in tokens access_matrix",
+        "basic_authentication sign_in tokens oidc access_matrix engine crowd",
     ),
     _of_service("tokens", "usecases/tokens.py db/tokens.py", "tokens oidc jobs"),
     _of_service("quotas", "usecases/quotas.py db/usage.py", "storage_quota jobs"),

@@ -164,6 +164,11 @@ def test_who_sends_no_token_is_told_both_ways(client: TestClient):
     assert challenges(client, {"Sec-Fetch-Site": "none", **LINK}) == both
 
 
+def test_a_web_token_is_refused_as_any_wrong_one_where_no_issuer_is_trusted(client: TestClient):
+    for headers in (basic("a.b.c"), {"Authorization": "Bearer a.b.c"}):
+        assert client.get("/tokens/self", headers=headers).status_code == 401
+
+
 def test_no_challenge_makes_a_browser_ask_for_a_password_over_the_map(client: TestClient):
     """The page sends a bearer token, or none, by scripts; it has its own form to sign in."""
     script = {"Sec-Fetch-Site": "same-origin", "Sec-Fetch-Mode": "cors", "Sec-Fetch-Dest": "empty"}

@@ -4,8 +4,9 @@ from uuid import uuid4
 
 import psycopg
 import pytest
-from sqlalchemy import func, select, text
+from sqlalchemy import QueuePool, func, select, text
 
+from app.api.deps import UPLOADS_AT_ONCE, threads_for
 from app.config import Settings
 from app.db import engine
 from app.db.engine import Database
@@ -33,6 +34,18 @@ def test_a_caller_gives_up_when_no_connection_is_free_in_time(
         database.reading(),
     ):
         pass
+
+
+@pytest.mark.parametrize("pool_size", [1, 8, 100])
+def test_uploads_that_all_arrive_slowly_leave_a_thread_for_each_connection(
+    dsn: str, settings: Settings, pool_size: int
+):
+    sized = settings.model_copy(update={"pool_size": pool_size})
+    with engine.pooled(dsn, sized) as database:
+        pools = [one.pool for one in (database.reader, database.writer)]
+        assert all(isinstance(pool, QueuePool) for pool in pools)
+        connections = sum(pool.size() for pool in pools)
+    assert threads_for(sized) == UPLOADS_AT_ONCE + connections
 
 
 def test_connections_that_died_in_the_pool_are_replaced_unseen(dsn: str, database: Database):
