@@ -20,7 +20,7 @@ from benchmarks._joint_scenes import (
 from services.adjustment.rigorous_parameters import RigorousParameters, rigorous_parameters
 from services.errors import InputError
 from services.imagery.scene import Scene
-from services.joint.block import JointBlock
+from services.joint.block import JointBlock, adjust_together
 from services.joint.fitting import adjust_fitting, ties_between
 from services.joint.measured import MeasuredScene, nothing_found
 from services.joint.nearest import nearest_correction, scene_heights_m
@@ -272,3 +272,25 @@ def test_a_bent_rigorous_scene_is_named_and_does_not_spoil_the_others() -> None:
     without = replace(truth, images=truth.images[1:])
     assert max(normalised(without, block, number) for number in range(3)) < 4.0
     assert max(largest_m(without, block, number) for number in range(3)) < 1.2
+
+
+@pytest.mark.long
+def test_what_no_affine_correction_states_of_a_rigorous_model_is_in_its_accuracy() -> None:
+    """At the lowest and the highest ground: a tenth of the variance of lines, by this set."""
+    rng = np.random.default_rng(34)
+    truth = mixed(rng, SRP)
+    truth = replace(truth, images=truth.images[:1])
+    measured = measured_scene(truth, 0, rng)
+    block = adjust_together([measured], tie_points(truth.images, truth.true_lon_lat_h, rng), OPTIONS)
+    at = rng.uniform(0.0, SHAPE[0], (2000, 2))
+    ground = block.images[0].model.locate(at, rng.choice(scene_heights_m(block, 0), 2000))
+    design = block.images[0].computed(block.values(0), ground).by_parameters
+    exact = np.einsum("nck,kl,ncl->nc", design, block.covariance(0), design).mean(axis=0)
+    local_px2 = nearest_correction(block, 0).local_px ** 2
+    assert local_px2[0] > 0.08 * exact[0]
+    adjustment = scene_adjustment(block, 0, OPTIONS)
+    assert measured.alone is not None
+    other_px2 = measured.alone.local_sigma_px**2
+    stated = np.diagonal(adjustment.covariance_at(at), 0, 1, 2).mean(axis=0) - other_px2
+    # Borders count more than in the mean of an image.
+    assert ((0.97 * exact < stated) & (stated < 1.1 * exact)).all()
