@@ -19,7 +19,7 @@ from services.vectors.accuracy import ErrorSources, predict_vertices
 from services.vectors.correct import CorrectedVectors, correct_vectors, missed_place
 from services.vectors.project import HIDDEN_M, project_vectors
 from services.vectors.shapes import Geometries, geometries_of, shapes_of
-from tests.services.vectors_world import CRS, GSD_M, SHAPE, heights, image_places, scene, terrain
+from tests.services.vectors_world import CRS, DEM, GSD_M, SHAPE, heights, image_places, scene, terrain
 
 a_millimetre = 1e-3
 a_thousandth_of_a_pixel = 1e-3
@@ -106,6 +106,19 @@ def test_edges_follow_the_ground_within_the_tolerance(crs: str) -> None:
         worst_straight_px = max(worst_straight_px, shapely.distance(chord, on_map).max() / GSD_M)
     assert worst_straight_px > 5.0
     assert worst_px < the_tolerance_px
+
+
+def test_edges_have_no_more_vertices_than_half_of_the_tolerance_needs() -> None:
+    """As many as the Douglas-Peucker of GEOS leaves of the same edges; the other half is unseen."""
+    lines, needed = long_lines(20), 0
+    for a, b in shapely.get_coordinates(lines).reshape(-1, 2, 2):
+        places = a + np.linspace(0.0, 1.0, 4000)[:, None] * (b - a)
+        met = xy_of_lon_lat(CRS, intersect_terrain(scene().model, places, terrain())[:, :2])
+        path = shapely.simplify(
+            shapely.linestrings(met), 0.5 * the_tolerance_px * GSD_M, preserve_topology=False
+        )
+        needed += shapely.get_num_coordinates(path) - 2
+    assert corrected(lines, terrain(), the_tolerance_px).added == pytest.approx(needed, rel=0.2)
 
 
 def test_ground_without_relief_needs_no_more_vertices() -> None:
@@ -248,3 +261,40 @@ def test_what_nobody_stated_is_unknown() -> None:
     of_model = ErrorSources(None, 5.0, 0.0, 0.0)
     level = predict_vertices(scene().model, terrain(0.0), line_sample, met, of_model)
     np.testing.assert_allclose(level.on_the_earth_ce90_m, 5.0 * 2.146, rtol=1e-3)
+
+
+@pytest.mark.parametrize("slope", [(0.5, 0.0), (-0.5, 0.0), (0.2, 0.6), (0.0, 0.0)])
+def test_on_sloping_ground_errors_move_a_vertex_as_its_line_of_sight_meets_the_slope(
+    slope: tuple[float, float],
+) -> None:
+    """Ground that rises east and north by these; a step in the image, and of all heights."""
+    view, line_sample = scene(25.0), image_places(5)
+    nodes = np.stack(np.indices(DEM.shape), axis=-1).reshape(-1, 2).astype(np.float64)
+    lon_lat = DEM.lon_lat(nodes)
+    metres = metres_per_degree_at(np.append(lon_lat.mean(axis=0), 700.0)[None])[0]
+    height_m = 700.0 + (lon_lat - lon_lat.mean(axis=0)) * metres @ np.array(slope)
+    plane = height_m.reshape(DEM.shape)
+
+    def met(seen: Array, raised_m: float = 0.0) -> Array:
+        return intersect_terrain(view.model, seen, Terrain(DEM, ArrayImage(plane + raised_m)))
+
+    ground = met(line_sample)
+    by_line, by_sample, by_height = (
+        (met(line_sample + step, raised_m) - ground)[:, :2] * metres
+        for step, raised_m in (([1.0, 0.0], 0.0), ([0.0, 1.0], 0.0), ([0.0, 0.0], 1.0))
+    )
+    expected_m2 = {
+        (3.0, 0.0): 9.0 * (outer(by_line) + outer(by_sample)),
+        (0.0, 2.0): 4.0 * outer(by_height),
+    }
+    for (vertex_px, height_sigma_m), of_errors in expected_m2.items():
+        sources = ErrorSources(None, 0.0, height_sigma_m, vertex_px)
+        terrain_of = Terrain(DEM, ArrayImage(plane))
+        stated = predict_vertices(view.model, terrain_of, line_sample, ground, sources)
+        tolerance = 0.02 * np.abs(of_errors).max()
+        np.testing.assert_allclose(stated.on_the_earth_m2, of_errors, atol=tolerance)
+
+
+def outer(error: Array) -> Array:
+    """Each error (n, 2) times itself, (n, 2, 2)."""
+    return error[:, :, None] * error[:, None, :]

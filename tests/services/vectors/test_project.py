@@ -1,12 +1,23 @@
 """Vectors of the map lie in the raw image where it shows them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import shapely
 
 from services.errors import InputError
 from services.map_grid import xy_of_lon_lat
-from services.vectors.project import cut, ground_outline, hidden_share, image_outline, project_vectors
+from services.vectors.accuracy import ErrorSources
+from services.vectors.correct import correct_vectors
+from services.vectors.project import (
+    ProjectedVectors,
+    cut,
+    ground_outline,
+    hidden_share,
+    image_outline,
+    project_vectors,
+)
 from services.vectors.shapes import geometries_of, shapes_of
 from tests.services.vectors_world import CRS, SHAPE, heights, image_places, scene, terrain
 
@@ -92,3 +103,25 @@ def test_geometries_are_cut_at_the_border() -> None:
 def test_places_without_heights_have_no_position() -> None:
     line = shapely.linestrings([[on_map(1)[0], on_map(1)[0] + 30_000.0]])
     assert project_vectors(shapes_of(line), scene(), terrain(), CRS, tolerance_px=0.2).missed.all()
+
+
+@pytest.mark.parametrize("crs", [CRS, "EPSG:4979"])
+def test_vectors_with_heights_return_to_the_image_they_were_corrected_from(crs: str) -> None:
+    """Their heights refer to the geoid of the terrain, or to the ellipsoid where the map has heights."""
+    over = replace(terrain(), geoid=lambda lon_lat: 40.0 + 10.0 * lon_lat[:, 0])
+    points = shapes_of(shapely.points(image_places(20)))
+    there = correct_vectors(
+        points, scene(), over, crs, sources=ErrorSources(None, np.nan, 0.0, 0.0), tolerance_px=0.2
+    )
+    back = project_vectors(there.shapes, scene(), over, crs, tolerance_px=0.2)
+    np.testing.assert_allclose(back.shapes.vertices, there.line_sample, atol=0.01)
+
+
+def test_the_hidden_share_is_that_of_the_vertices_of_each_geometry() -> None:
+    """A vertex that two of them have counts in both, and one that a ring has twice counts twice."""
+    crossing = [[0.0, 0.0], [0.0, 4.0], [4.0, 4.0]]
+    shapes = shapes_of(np.array([shapely.LineString(crossing), shapely.Polygon(crossing)]))
+    hidden = (shapes.vertices == 0.0).all(axis=1)
+    ground = np.zeros((len(hidden), 3))
+    share = hidden_share(ProjectedVectors(shapes, ground, hidden, np.zeros(2, dtype=bool), 0))
+    np.testing.assert_allclose(share, [1.0 / 3.0, 2.0 / 4.0])
