@@ -10,6 +10,7 @@ import rasterio
 
 from services.errors import ComputationError, CoverageError
 from services.formats.images.ortho import write_cog
+from services.geodesy import metres_per_degree_at
 from services.imagery.scene import Scene
 from services.imagery.source import ArrayImage
 from services.lines_of_sight import intersect_terrain
@@ -365,3 +366,44 @@ def test_saturated_pixels_are_written_as_the_saturated_value(
     nearly_white = 4094 if written == 4095 and dtype != "float32" else 4095
     least = 1 if dtype != "float32" else pytest.approx(0.2)
     assert stored == [0, written, nearly_white, least, 700, 4094]
+
+
+@pytest.mark.parametrize("undulation_m", [-60.0, 80.0])
+def test_positions_are_those_of_the_heights_above_the_ellipsoid(undulation_m: float) -> None:
+    """Between the lowest and the highest of these a model is interpolated, and nowhere beyond."""
+    step = np.array([[0.0, 1.0], [-1.0, 0.0]]) * 2.0 * METRE_DEG
+    grid = MapGrid("EPSG:4326", np.zeros(2), step, (80, 80))
+    heights = np.linspace(-100.0, 100.0, 80 * 80, dtype=np.float32).reshape(80, 80)
+    above_geoid = Terrain(
+        grid,
+        ArrayImage(heights - np.float32(undulation_m)),
+        lambda at: np.full(len(at), undulation_m),
+    )
+    window, model = Window(0, 0, 80, 80), BentByHeight(cubic_px=0.2)
+    mapping = map_into_image(model, above_geoid, grid, window, the_tolerance_px)
+    assert mapping is not None
+    np.testing.assert_allclose(mapping.height_m, heights, atol=1e-3)
+    pixels = np.stack(np.indices((80, 80)), axis=-1).reshape(-1, 2).astype(np.float64)
+    exact = model.project(np.column_stack([grid.lon_lat(pixels), heights.ravel()]))
+    assert np.abs(mapping.line_sample.reshape(-1, 2) - exact).max() < the_tolerance_px
+
+
+@pytest.mark.parametrize("gsd_m", [6.0, 10.0, 13.0])
+def test_a_coarse_map_shows_the_image_as_blurred_as_its_pixels_are_large(gsd_m: float) -> None:
+    """White noise under a Gaussian of 0.4 of the root of the squared ratio less one, and no more."""
+    ground = terrain(0.0)
+    noise = np.random.default_rng(4).standard_normal(SHAPE).astype(np.float32)
+    rendered = assembled([ArrayImage(noise)], ground, choose_grid(scene(), ground, gsd_m=gsd_m))[0]
+    area = rendered[np.isfinite(rendered)]
+    sigma_px = 0.4 * np.sqrt((gsd_m / GSD_M) ** 2 - 1.0)
+    expected_std = 1.0 / (2.0 * np.sqrt(np.pi) * sigma_px)
+    assert area.std() == pytest.approx(expected_std, rel=0.25)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:32631"])
+def test_pixels_of_a_map_are_as_long_as_wide_on_the_ground(crs: str) -> None:
+    grid = choose_grid(scene(), terrain(), crs, gsd_m=3.0)
+    corner, right, down = grid.lon_lat(np.array([[80.0, 80.0], [80.0, 81.0], [81.0, 80.0]]))
+    metres = metres_per_degree_at(np.array([[*corner, 0.0]]))[0]
+    for step in (right - corner, down - corner):
+        assert np.hypot(*(step * metres)) == pytest.approx(3.0, rel=0.002)
