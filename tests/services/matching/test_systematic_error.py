@@ -139,3 +139,36 @@ def test_without_a_measure_the_error_is_the_smallest() -> None:
         LIKE_THE_SCENE, views_of(LIKE_THE_SCENE), np.arange(0), np.zeros((0, 2)), np.zeros(0)
     )
     np.testing.assert_allclose(empty, COMMON_SIGMA_PX**2 * np.eye(2))
+
+
+def test_views_count_by_their_weights_in_what_parallax_makes_of_heights() -> None:
+    """A quarter of the weight looks from the other side; what agrees with nothing has none."""
+    n = 30
+    views = views_of(LIKE_THE_SCENE, n)
+    kind = np.arange(n) % 3
+    azimuth_deg = np.choose(kind, [NORTH, SOUTH, EAST])
+    weight = np.choose(kind, [0.75, 0.25, 0.0])
+    turned = replace(views, azimuth_deg=azimuth_deg)
+    before, after = (
+        common_covariance_px2(LIKE_THE_SCENE, of, np.arange(n), np.zeros((n, 2)), weight)
+        for of in (views, turned)
+    )
+    along_px = 0.25 * HEIGHT_SIGMA_PX * 2.0 * np.tan(np.radians(20.0))
+    np.testing.assert_allclose(after - before, [[0.0, 0.0], [0.0, along_px**2]], atol=1e-12)
+
+
+def test_an_unknown_sun_is_worse_than_one_with_other_shadows() -> None:
+    """Shadows that are known get less weight; those that are not keep theirs."""
+    lower_deg = np.degrees(np.arctan(1.0 / (1.0 / np.tan(np.radians(60.0)) + 1.0 / 3.0)))
+    unknown, lower = (
+        common(replace(LIKE_THE_SCENE, sun_elevation_deg=deg)) - common(LIKE_THE_SCENE)
+        for deg in (float("nan"), lower_deg)
+    )
+    assert 2.0 * lower[1, 1] < unknown[1, 1] < 8.0 * lower[1, 1]
+
+
+def test_views_that_agree_with_nothing_tell_nothing_of_directions() -> None:
+    n = 12
+    across = views_of(replace(LIKE_THE_SCENE, azimuth_deg=SOUTH, sun_elevation_deg=20.0), n)
+    found = common_covariance_px2(LIKE_THE_SCENE, across, np.arange(n), np.zeros((n, 2)), np.zeros(n))
+    np.testing.assert_allclose(found, COMMON_SIGMA_PX**2 * np.eye(2), atol=1e-12)

@@ -115,3 +115,14 @@ def test_no_points_have_no_selected_views() -> None:
     selected = select_views(points, 1.0, SCENE, 2, ViewDistanceScales())
     assert len(selected.row) == 0
     np.testing.assert_array_equal(selected.start, [0])
+
+
+def test_twice_the_loss_of_health_is_four_times_as_far() -> None:
+    views = point_with_views([2.0] * 3, [20.0] * 3, [10.0] * 3, SCENE).views
+    worse = replace(views, health=np.array([1.0, 1.0, 0.8, 0.6]))
+    far = view_distances(worse, SCENE, ViewDistanceScales()) - view_distances(
+        views, SCENE, ViewDistanceScales()
+    )
+    assert far[1] == pytest.approx(0.0)
+    assert far[3] == pytest.approx(4.0 * far[2])
+    assert far[2] > 0.0
