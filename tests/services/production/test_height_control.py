@@ -96,3 +96,41 @@ def test_heights_of_ortho_images_err_with_the_slope_where_image_and_model_lie_of
     np.testing.assert_allclose(
         known.lon_lat_h[:, 2], ground(0.0, 0.3).terrain.height_m(places()), atol=a_millimetre
     )
+
+
+def test_ground_that_is_no_plane_is_as_uncertain_as_it_deviates_from_one() -> None:
+    """Waves of 60 m, seen over the square within which a point may lie: two sigmas to each side."""
+    posting_m, amplitude_m, length_m = 2.5, 0.9, 60.0
+    grid = replace(GRID, step_xy=np.array([[0.0, posting_m], [-posting_m, 0.0]]))
+    along_m = np.arange(SIDE) * posting_m
+    wave_m = 500.0 + amplitude_m * np.sin(2.0 * np.pi * along_m / length_m)
+    terrain = Terrain(grid, ArrayImage(np.tile(wave_m, (SIDE, 1)).astype(np.float32)))
+    heights = ControlHeights("dem", terrain, DEM_SIGMA_M, Frame.from_sigmas(*DEM_FRAME_M))
+    sample = np.linspace(100.0, 300.0, 57)
+    lon_lat = grid.lon_lat(np.column_stack([np.full(57, 200.0), sample]))
+    points = np.column_stack([lon_lat, np.zeros(57)])
+    known = known_heights(points, surfaces(57), PLACE_M, heights)
+    assert len(known.point) == 57
+    x_m = np.random.default_rng(3).uniform(-2.0 * OFF_M, 2.0 * OFF_M, (57, 2000))
+    at_m = sample[:, None] * posting_m + x_m
+    deviation_m, slope = np.empty(57), np.empty(57)
+    for row in range(57):
+        wave = amplitude_m * np.sin(2.0 * np.pi * at_m[row] / length_m)
+        line = np.polyfit(x_m[row], wave, 1)
+        deviation_m[row], slope[row] = (wave - np.polyval(line, x_m[row])).std(), line[0]
+    known_m2 = DEM_SIGMA_M**2 + SURFACE_SIGMA_M**2 + ((slope - slope.mean()) * OFF_M) ** 2
+    rough_m2 = known.covariance_m2[:, 2, 2] - known_m2
+    crests = np.abs(slope) < 0.02
+    assert crests.sum() > 5
+    ratio = np.sqrt(np.median(rough_m2[crests]) / np.median(deviation_m[crests] ** 2))
+    # The border of the square counts more than its middle.
+    assert 0.8 < ratio < 1.6
+
+
+def test_the_most_precise_of_many_heights_take_part() -> None:
+    """Four hundred of 480: those whose surfaces the images show best."""
+    points = np.tile(places(), (6, 1))
+    sigma_m = np.random.default_rng(9).permutation(np.linspace(0.1, 2.0, len(points)))
+    above = SurfaceHeights(np.full(len(points), ABOVE_M), sigma_m)
+    known = known_heights(points, above, PLACE_M, ground(0.0, 0.0))
+    np.testing.assert_array_equal(known.point, np.flatnonzero(sigma_m <= np.sort(sigma_m)[399]))
