@@ -13,6 +13,7 @@ from services.production.block_plan import (
     PlannedHeights,
     PlannedImage,
     PlannedSite,
+    SiteSigmas,
     observed_and_known,
     plan_geometry,
 )
@@ -155,3 +156,67 @@ def test_what_cannot_be_computed_is_refused() -> None:
     apart = (*strip(2), *(replace(one, name=f"far {one.name}", lon_lat=(7.0, 43.3)) for one in strip(2)))
     with pytest.raises(DisconnectedBlock, match="far image 1, far image 2"):
         forecast(replace(PLAN, images=apart, spacing_m=1000.0, candidates=()))
+
+
+def test_a_plan_without_sites_lies_as_its_models_do_whatever_their_pixels() -> None:
+    """Stated in metres: the frame of five images is between one of them and their mean."""
+    sigmas_m = []
+    for gsd_m in (2.0, 5.0):
+        images = tuple(replace(image, gsd_m=gsd_m, slope=1e-6) for image in strip())
+        plan = replace(PLAN, images=images, sites=(), candidates=(), spacing_m=2000.0)
+        frame = block_of(plan, plan_geometry(plan), []).frames[0]
+        sigmas_m.append(frame.sigma_m)
+        assert 0.8 * 6.0 / np.sqrt(5.0) < frame.sigma_m < 6.0
+    assert sigmas_m[0] == pytest.approx(sigmas_m[1], rel=0.1)
+
+
+def test_relief_of_a_planned_ortho_image_leans_away_from_its_satellite() -> None:
+    """Ground a hundred metres above its terrain, seen from 280 degrees at 8 degrees: to the east."""
+    geometry = plan_geometry(MIXED)
+    model, (lon, lat) = geometry.images[2].model, MIXED.images[2].lon_lat
+    low, high = model.project(np.array([[lon, lat, 0.0], [lon, lat, 100.0]]))
+    lean_m = (high - low)[::-1] * [10.0, -10.0]
+    towards = np.radians(MIXED.images[2].azimuth_deg)
+    expected_m = -100.0 * np.tan(np.radians(8.0)) * np.array([np.sin(towards), np.cos(towards)])
+    np.testing.assert_allclose(lean_m, expected_m, atol=1.0)
+
+
+def test_a_loosely_known_site_counts_by_the_squares_of_its_sigmas() -> None:
+    """Five points of 4 m, and models of 6 m each, tell of the frame what both know."""
+    loose = SiteSigmas(points=5, sigma_m=(4.0, 4.0), frame_sigma_m=(0.1, 0.1))
+    images = tuple(replace(image, slope=1e-6) for image in strip())
+    plan = replace(PLAN, images=images, sites=(replace(sites()[2], sigmas=loose),), candidates=())
+    plan = replace(plan, spacing_m=2000.0)
+    geometry = plan_geometry(plan)
+    free, held = (block_of(plan, geometry, known).frames[0].sigma_m for known in ([], [0]))
+    of_site_m2 = 4.0**2 / 5.0 + 0.1**2
+    assert held == pytest.approx((free**-2.0 + 1.0 / of_site_m2) ** -0.5, rel=0.25)
+
+
+def test_heights_of_a_model_are_those_of_the_points_where_rays_tell_less() -> None:
+    heights = PlannedHeights(sigma_m=0.2, frame_sigma_m=0.01)
+    plan = replace(PLAN, heights=heights, candidates=(), spacing_m=2000.0)
+    geometry = plan_geometry(plan)
+    block = block_of(plan, geometry, [0])
+    known = np.isin(np.arange(len(geometry.site)), geometry.observations.point) & (block.group >= 0)
+    up_m = np.sqrt(block.point_covariance_m2[known, 2, 2])
+    assert 0.19 < np.median(up_m) < 0.3
+
+
+def test_a_second_site_gains_what_it_adds_to_the_first() -> None:
+    plan = replace(PLAN, images=strip(3), candidates=sites()[1:3], added=2, spacing_m=2000.0)
+    first, second = forecast(plan).proposed
+    gained_m = first.on_the_earth.ce90_m - second.on_the_earth.ce90_m
+    assert np.nanmax(second.gain_m) == pytest.approx(gained_m)
+    assert 0.0 < gained_m < np.nanmax(first.gain_m)
+
+
+def test_the_accuracy_of_a_plan_is_that_of_its_places() -> None:
+    """What is stated of all of them are the means and the largest of what is stated of each."""
+    found = forecast(replace(PLAN, candidates=(), spacing_m=2000.0))
+    stated = found.on_the_earth
+    assert stated.ce90_m == pytest.approx(found.ce90_m.mean())
+    assert stated.le90_m == pytest.approx(found.le90_m.mean())
+    assert stated.worst_ce90_m == pytest.approx(found.ce90_m.max())
+    assert stated.worst_le90_m == pytest.approx(found.le90_m.max())
+    assert found.relative.le90_m < stated.le90_m
