@@ -12,6 +12,7 @@ from services.imagery.scene import Scene, scene_gsd_m
 from services.imagery.source import ArrayImage
 from services.production.block_residuals import FITS, ImageFit, image_fits, point_fits
 from services.types import Array, Observations
+from tests.services.production.displaced_details import drawn_details, map_moved
 from tests.services.simulated import block_views, world
 
 STATED_M = 10.0
@@ -120,3 +121,24 @@ def test_a_point_with_a_wrong_ray_loses_it_and_keeps_the_others(scenes: list[Sce
     assert found.used.tolist() == [len(scenes), len(scenes) - 1]
     assert (found.largest_px < 5.0 * NOISE_PX).all()
     assert (found.rms_px <= found.largest_px).all()
+
+
+def test_an_image_is_off_in_metres_and_bent_beside_the_middle_one(scenes: list[Scene]) -> None:
+    """Ortho-images of 2 m: one lies off by 50 m of a stated 10 m, one has four times the residuals."""
+    measures = measured(scenes, np.zeros((len(scenes), 2)))
+    block = adjusted(scenes, measures)
+    details, count = drawn_details(3), len(scenes)
+    taken = [details.scene(f"image {k}", np.zeros((9, 2)), STATED_M) for k in range(count)]
+    models = [details.model] * count
+    models[0] = map_moved(details.model, np.array([0.0, -50.0]))
+    rng = np.random.default_rng(5)
+    residual_px = rng.normal(0.0, 1.0, (len(measures), 2))
+    residual_px[measures.image == count - 1] *= 4.0
+    block = replace(
+        block, models=tuple(models), residual_px=residual_px, active=np.ones(len(measures), dtype=bool)
+    )
+    fits = image_fits(taken, measures, block)
+    assert fits[0].verdict == "off by 5.0 times the accuracy stated for it"
+    np.testing.assert_allclose(np.abs(fits[0].off_m), [0.0, 50.0], atol=0.1)
+    assert "its model is bent" in fits[-1].verdict
+    assert {one.verdict for one in fits[1:-1]} == {FITS}

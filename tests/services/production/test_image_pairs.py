@@ -8,6 +8,7 @@ from services.imagery.source import ArrayImage
 from services.map_grid import MapGrid
 from services.production.image_pairs import PARTNERS, image_pairs
 from services.sensors.ortho import OrthoModel
+from services.simulation.orbit import pushbroom_over
 from services.types import Acquisition, BoolArray, IntArray
 
 GSD_M = 10.0
@@ -76,3 +77,17 @@ def test_pairs_do_not_depend_on_the_order_of_the_images(count: int) -> None:
     here = {tuple(sorted(pair)) for pair in image_pairs(scenes, []).tolist()}
     shuffled = image_pairs([scenes[i] for i in order], [])
     assert {tuple(sorted((int(order[i]), int(order[j])))) for i, j in shuffled.tolist()} == here
+
+
+def test_of_images_of_one_place_those_from_one_side_are_partners() -> None:
+    """Ten look from the east, ten from the west; of those of one side, none shows the very same place."""
+    blank = ArrayImage(np.zeros((SIDE, SIDE), dtype=np.float32))
+    scenes = []
+    for number in range(20):
+        target = np.array([3.0 + 0.0003 * (number % 10), 43.3, 0.0])
+        direction = (30.0, 90.0 if number < 10 else 270.0)
+        model = pushbroom_over(target, (SIDE, SIDE), GSD_M, direction, (-10.0, 10.0))
+        scenes.append(Scene(blank, model, Acquisition(f"image_{number}"), 5.0))
+    pairs = image_pairs(scenes, [])
+    assert (pairs // 10 == pairs[:, :1] // 10).all()
+    assert len(pairs) >= 10 * PARTNERS

@@ -11,6 +11,7 @@ from services.errors import CoverageError
 from services.imagery.catalogue import ImageCatalogue
 from services.production.image_selection import (
     SelectionOptions,
+    default_cell_m,
     duplicates,
     image_steps,
     select_images,
@@ -229,3 +230,18 @@ def test_an_area_beside_all_footprints_is_refused():
 def test_images_beside_the_area_are_not_chosen(catalogue, selection):
     for row in selection.image:
         assert catalogue.footprint[row].intersects(AREA)
+
+
+def test_an_image_is_used_below_a_cloud_limit_and_not_at_it() -> None:
+    mask = np.full(4, shapely.MultiPolygon(), dtype=object)
+    images = stack(4, cloud_percent=np.array([14.9, 15.0, 79.9, 80.0]), mask=mask)
+    np.testing.assert_array_equal(image_steps(images, SelectionOptions()), [0, 1, 4, -1])
+
+
+def test_cells_are_as_large_for_footprints_of_one_size_at_every_latitude() -> None:
+    at_equator, far_north = (
+        stack(3, footprint=np.full(3, box, dtype=object))
+        for box in (shapely.box(0.0, -0.5, 1.0, 0.5), shapely.box(0.0, 59.5, 2.0, 60.5))
+    )
+    assert default_cell_m(far_north) == pytest.approx(default_cell_m(at_equator), rel=0.01)
+    assert default_cell_m(at_equator) == pytest.approx(111_200.0 / 12.0, rel=0.01)
