@@ -383,7 +383,7 @@ def test_positions_are_those_of_the_heights_above_the_ellipsoid(undulation_m: fl
     mapping = map_into_image(model, above_geoid, grid, window, the_tolerance_px)
     assert mapping is not None
     np.testing.assert_allclose(mapping.height_m, heights, atol=1e-3)
-    pixels = np.stack(np.indices((80, 80)), axis=-1).reshape(-1, 2).astype(np.float64)
+    pixels = np.moveaxis(np.indices((80, 80)), 0, -1).reshape(-1, 2).astype(np.float64)
     exact = model.project(np.column_stack([grid.lon_lat(pixels), heights.ravel()]))
     assert np.abs(mapping.line_sample.reshape(-1, 2) - exact).max() < the_tolerance_px
 

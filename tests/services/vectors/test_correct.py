@@ -269,7 +269,7 @@ def test_on_sloping_ground_errors_move_a_vertex_as_its_line_of_sight_meets_the_s
 ) -> None:
     """Ground that rises east and north by these; a step in the image, and of all heights."""
     view, line_sample = scene(25.0), image_places(5)
-    nodes = np.stack(np.indices(DEM.shape), axis=-1).reshape(-1, 2).astype(np.float64)
+    nodes = np.moveaxis(np.indices(DEM.shape), 0, -1).reshape(-1, 2).astype(np.float64)
     lon_lat = DEM.lon_lat(nodes)
     metres = metres_per_degree_at(np.append(lon_lat.mean(axis=0), 700.0)[None])[0]
     height_m = 700.0 + (lon_lat - lon_lat.mean(axis=0)) * metres @ np.array(slope)
