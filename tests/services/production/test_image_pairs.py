@@ -80,7 +80,7 @@ def test_pairs_do_not_depend_on_the_order_of_the_images(count: int) -> None:
 
 
 def test_of_images_of_one_place_those_from_one_side_are_partners() -> None:
-    """Ten look from the east, ten from the west; of those of one side, none shows the very same place."""
+    """Ten look from the east, ten from the west; of one side, none shows the very same place."""
     blank = ArrayImage(np.zeros((SIDE, SIDE), dtype=np.float32))
     scenes = []
     for number in range(20):
