@@ -11,8 +11,14 @@ from services.geodesy import move_metres
 from services.imagery.scene import Scene
 from services.imagery.source import ArrayImage
 from services.matching.chip_extent import MIN_VISIBLE_SIDE
+from services.registration.chip_selection import visibility_probability
 from services.registration.context import Prediction
-from services.registration.point_selection import initial_prediction, points_to_try, visible_points
+from services.registration.point_selection import (
+    initial_prediction,
+    points_expected,
+    points_to_try,
+    visible_points,
+)
 from services.sensors.correction import CorrectedModel, no_correction
 from services.simulation.view import plan_geometry
 from services.types import Array, BoolArray, ControlPoints
@@ -107,3 +113,22 @@ def test_a_scene_beside_all_points_is_refused() -> None:
         visible_points(scene, elsewhere)
     with pytest.raises(CoverageError, match="no control point"):
         visible_points(scene, points.take(np.arange(0)))
+
+
+def test_so_many_points_are_taken_that_the_scene_is_expected_to_show_a_number_of_them() -> None:
+    """Of those with chips of a metre: the sum of their probabilities reaches the number, and no more."""
+    scene, points = small_scene(), block()[0]
+    prediction = prediction_within(SIGMA_M, scene, points)
+    probability = visibility_probability(scene, points, prediction, 1.0)
+    assert probability.sum() > 8.0
+    for count in (3, 6):
+        rows = points_expected(scene, points, prediction, 1.0, count=count)
+        assert count <= probability[rows].sum() < count + 1.0
+
+
+def test_a_point_is_as_uncertain_as_the_model_and_its_worse_coordinate_together() -> None:
+    scene, points = small_scene(), block()[0]
+    for sigmas_m in ((80.0, 20.0, 500.0), (20.0, 80.0, 500.0)):
+        wrong = replace(points, covariance_m2=np.tile(np.diag(sigmas_m) ** 2, (len(points), 1, 1)))
+        stated_m = initial_prediction(scene, wrong).uncertainty_m
+        np.testing.assert_allclose(stated_m, np.hypot(SIGMA_M, 80.0))
