@@ -67,3 +67,18 @@ def test_a_footprint_that_names_the_pole_as_a_corner_is_taken_as_written():
     shape = footprint_on_ground(shapely.polygons([(-180, 85), (180, 85), (180, 90), (-180, 90)]))
     assert has(shape, 123.0, 86.0)
     assert shape.area == pytest.approx(360.0 * 5.0)
+
+
+@pytest.mark.parametrize("pole", [-1.0, 1.0])
+def test_a_ring_around_a_pole_is_on_its_own_side_of_the_earth(pole: float) -> None:
+    """Sixteen corners at 80 degrees: a cap of ten degrees, and nothing beyond it."""
+    shape = footprint_on_ground(ring(pole * 80.0, corners=16))
+    for lon in (-170.0, -40.0, 3.0, 95.0):
+        assert has(shape, lon, pole * 83.0)
+        assert not has(shape, lon, pole * 79.0)
+        assert not has(shape, lon, 0.0)
+        assert not has(shape, lon, -pole * 83.0)
+    beside = footprint_on_ground(shapely.box(10.0, pole * 78.0, 20.0, pole * 79.0))
+    south, north = beside.bounds[1], beside.bounds[3]
+    assert 77.8 < min(abs(south), abs(north)) < max(abs(south), abs(north)) < 79.3
+    assert np.sign(south) == np.sign(north) == pole

@@ -321,3 +321,16 @@ def test_a_geographic_ortho_image_at_60_degrees_north_has_half_the_sampling_to_t
     gsd_m = image_gsd_m(OrthoModel(grid), np.array([10.0, 60.0, 0.0]))
     assert gsd_m == pytest.approx(np.sqrt(east_m * north_m), rel=1e-6)
     assert gsd_m < 0.75 * north_m
+
+
+def test_means_of_an_image_that_is_read_once_are_of_the_squares_asked_for() -> None:
+    """The same window in larger squares, and a part of it in the squares that it has."""
+    rng = np.random.default_rng(6)
+    image = ArrayImage(rng.normal(size=(64, 64)).astype(np.float32))
+    cached, whole = CachedImage(image), Window(0, 0, 64, 64)
+    for factor in (2, 4, 2):
+        np.testing.assert_array_equal(
+            cached.means(whole, factor), block_means(image.read(whole), factor)
+        )
+    part = Window(8, 16, 32, 24)
+    np.testing.assert_array_equal(cached.means(part, 4), block_means(image.read(part), 4))
