@@ -17,7 +17,7 @@ from services.types import no_progress
 from tests.app.flat_world import SIGMA_M
 from tests.app.renewal_world import HALF_PX, make_years, write_scene
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 
 def test_points_under_clouds_of_a_mask_were_not_searched_and_those_that_changed_were(
