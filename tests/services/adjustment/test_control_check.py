@@ -1,0 +1,135 @@
+"""A known point is judged by what all others predict of it, whether it takes part or not."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from services.adjustment.block_accuracy import block_accuracy
+from services.adjustment.block_problem import BlockOptions, BlockProblem
+from services.adjustment.block_solution import checked_gauge, least_squares
+from services.adjustment.bundle import adjust_block
+from services.adjustment.control_check import agreeing_control
+from services.adjustment.control_ground import ControlGround
+from services.adjustment.parameters import AdjustableImage, block_priors, image_parameters
+from services.adjustment.robust_start import robust_start
+from services.geodesy import move_metres
+from services.types import Array, BoolArray, Frame, Observations
+from tests.services.simulated import ring_of_geometries
+from tests.services.ties import difference_m, make_ties
+
+STAYS = 0.9999
+"""Probability with which a control point as good as stated stays."""
+OWN_SIGMA_M = np.array([0.3, 0.4, 0.6])
+KNOWN = 4
+"""Few points place the block: each has drawn it towards itself."""
+ALL = np.ones(KNOWN, dtype=np.bool_)
+ALL_BUT_THE_FIRST = np.arange(KNOWN) > 0
+EXACT_FRAME = Frame.from_sigmas(0.001, 0.001)
+
+
+@dataclass(frozen=True)
+class Block:
+    """Images whose place is known to some metres, and points that are known where they are."""
+
+    images: Sequence[AdjustableImage]
+    observations: Observations
+    control: ControlGround
+
+    def moved(self, off_m: Array) -> "Block":
+        """The block whose first known point is stated elsewhere."""
+        lon_lat_h = self.control.lon_lat_h.copy()
+        lon_lat_h[:1] = move_metres(lon_lat_h[:1], off_m[None])
+        return replace(self, control=replace(self.control, lon_lat_h=lon_lat_h))
+
+    def without_the_first(self) -> ControlGround:
+        """The other known points."""
+        control = self.control
+        return ControlGround(
+            control.point[1:],
+            control.lon_lat_h[1:],
+            control.covariance_m2[1:],
+            control.source[1:],
+            control.frames,
+            control.names[1:],
+        )
+
+    def judged(self, active: BoolArray) -> BoolArray:
+        """The known points that agree after a solution in which some take part."""
+        priors = block_priors(self.images, [], self.control.frame_covariances())
+        n_points = int(self.observations.point[-1]) + 1
+        problem = BlockProblem(
+            self.images, self.observations, self.control, BlockOptions(), n_points, priors.size
+        )
+        state = robust_start(problem, priors)[0]
+        weight = problem.weights(np.ones(len(self.observations)), active)
+        equations = problem.equations(state.values, state.lon_lat_h, weight)
+        gauge = checked_gauge(problem, equations, state.lon_lat_h)
+        solved = least_squares(problem, priors, gauge, state, weight)
+        of_images = len(self.images) * priors.size
+        accuracy = block_accuracy(solved.system, problem.pairs, gauge, of_images)
+        return agreeing_control(problem, solved.equations, solved.points, accuracy, active)
+
+
+@pytest.fixture(scope="module")
+def block() -> Block:
+    geometries = ring_of_geometries(3)
+    ties = make_ties(geometries, np.random.default_rng(5), 30, 0.2)
+    images = [
+        image_parameters(g.plan.image_id, g.rpc, g.plan.shape, shift_px=8.0, order="shift")
+        for g in geometries
+    ]
+    control = ControlGround(
+        np.arange(KNOWN, dtype=np.int64),
+        ties.lon_lat_h[:KNOWN],
+        np.tile(np.diag(OWN_SIGMA_M**2), (KNOWN, 1, 1)),
+        np.zeros(KNOWN, dtype=np.int64),
+        (EXACT_FRAME,),
+        tuple(f"P{k + 1}" for k in range(KNOWN)),
+    )
+    return Block(images, ties.observations, control)
+
+
+def largest_m(block: Block, axis: int) -> float:
+    """How far off the first point may be along an axis: by the block that has the others alone."""
+    others = adjust_block(block.images, block.observations, control=block.without_the_first())
+    predicted_m2 = others.point_covariance_m2[0] + others.frames[0].covariance_m2
+    inverse = np.linalg.inv(predicted_m2 + block.control.covariance_m2[0])
+    towards = np.eye(3)[axis]
+    misfit_m = difference_m(block.control.lon_lat_h[:1], others.lon_lat_h[:1])[0]
+    # (misfit + s towards)^2 = limit, for the larger s.
+    a, b = towards @ inverse @ towards, towards @ inverse @ misfit_m
+    c = misfit_m @ inverse @ misfit_m - chi2.ppf(STAYS, 3)
+    return float((-b + np.sqrt(b**2 - a * c)) / a)
+
+
+@pytest.mark.parametrize("shared_m", [0.001, 5.0])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_known_point_leaves_and_comes_back_where_the_others_predict_it(
+    block: Block, axis: int, shared_m: float
+) -> None:
+    """What all known points share contradicts none of them."""
+    limit_m = largest_m(block, axis)
+    frames = (Frame.from_sigmas(shared_m, shared_m),)
+    shared = replace(block, control=replace(block.control, frames=frames))
+    for share, agrees in ((0.95, True), (1.05, False)):
+        moved = shared.moved(share * limit_m * np.eye(3)[axis])
+        expected = ALL if agrees else ALL_BUT_THE_FIRST
+        assert moved.judged(ALL).tolist() == expected.tolist()
+        assert moved.judged(ALL_BUT_THE_FIRST).tolist() == expected.tolist()
+
+
+def test_a_wrong_point_leaves_alone_although_it_draws_the_block_away_from_the_others(
+    block: Block,
+) -> None:
+    moved = block.moved(np.array([15.0, 0.0, 0.0]))
+    assert moved.judged(ALL).tolist() == ALL_BUT_THE_FIRST.tolist()
+
+
+def test_of_points_that_took_no_part_the_best_comes_back_first(block: Block) -> None:
+    of_two = np.array([False, False, True, True])
+    moved = block.moved(np.array([0.9, 0.0, 0.0]))
+    assert moved.judged(of_two).tolist() == ALL_BUT_THE_FIRST.tolist()
+    assert moved.judged(ALL_BUT_THE_FIRST).tolist() == ALL.tolist()
