@@ -12,6 +12,7 @@ from services.adjustment.image_correction import SceneAdjustment, adjust_scene
 from services.adjustment.short_motion import MAX_CHANCE, STRIPS, ChipStrips, ShortMotion, short_motion
 from services.quality.accuracy import normalised_error
 from services.sensors.correction import no_correction
+from services.sensors.displacement import DisplacementGrid
 from services.types import Array
 from tests.services.conftest import GSD_M, FlatModel
 
@@ -100,6 +101,25 @@ def test_scenes_that_do_not_move_are_not_accused() -> None:
     assert np.mean([one.variance_px2 for one in results]) < 0.02 * NOISE_PX**2
 
 
+@pytest.mark.monte_carlo
+def test_the_chance_of_a_scene_that_does_not_move_is_what_it_says() -> None:
+    """As many periods are tried as there are, and most scenes show none of them."""
+    results = [found(still, seed, count=40) for seed in range(400, 520)]
+    assert 0.005 < np.mean([one.structure.chance < 0.05 for one in results]) < 0.08
+    assert np.mean([one.variance_px2.any() for one in results]) < 0.4
+
+
+@pytest.mark.monte_carlo
+def test_lines_of_a_scene_whose_samples_swing_get_less_than_chance_shows_of_them() -> None:
+    results = [found(swing(200.0, (0.0, 1.0)), seed, count=40) for seed in range(40)]
+    contrasts = 40 * (STRIPS - 3)
+    by_chance_px2 = 2.0 * NOISE_PX**2 / contrasts
+    lines_px2, samples_px2 = np.mean([one.variance_px2 for one in results], axis=0)
+    assert samples_px2 == pytest.approx(0.5, rel=0.1)
+    # What exceeds its mean by chance, if the rest counts as nothing: 0.37 of an exponential law.
+    assert 0.2 * by_chance_px2 < lines_px2 < 1.2 * by_chance_px2
+
+
 def test_chips_that_overlap_are_no_further_evidence() -> None:
     """What one place shows by chance, it shows in all its chips: copies change nothing."""
     for seed in range(20):
@@ -182,6 +202,18 @@ def test_the_stated_accuracy_holds_motion_that_positions_of_chips_cannot_show(
     assert 0.7 < np.mean([square for _, square in results]) < 1.5
     named = [one for result, _ in results for one in result.structures if one.family == "chips"]
     assert all(one.chance < MAX_CHANCE for one in named)
+
+
+def test_a_displacement_moves_the_strips_of_a_chip_as_the_motion_that_it_follows() -> None:
+    motion, place = swing(700.0, (2.0, 3.0)), chips(np.random.default_rng(7), 30)
+    line, sample = np.linspace(0.0, SHAPE[0] - 1.0, 2000), np.array([0.0, SHAPE[1] - 1.0])
+    moved = np.repeat(motion(line)[:, None], 2, axis=1)
+    grid = DisplacementGrid(line, sample, moved, np.zeros(moved.shape))
+    shown = motion(place[:, :1] + MIDDLE)
+    strips_of_all = strips(still, place, np.random.default_rng(8))
+    np.testing.assert_allclose(
+        strips_of_all.against(grid, place), shown - shown.mean(axis=1, keepdims=True), atol=1e-3
+    )
 
 
 @pytest.mark.long
