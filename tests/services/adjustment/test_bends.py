@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from services.adjustment.bends import bends
 from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
@@ -169,3 +170,34 @@ def test_bends_are_the_same_however_far_the_model_is_off() -> None:
     assert len(found) == len(of_far) > 0
     for one, other in zip(found, of_far, strict=True):
         assert other.variance_px2 == pytest.approx(one.variance_px2, rel=1e-6)
+
+
+@pytest.mark.parametrize(("size_px", "sigma_px"), [(0.0, 0.3), (1.0, 0.3), (4.0, 0.8)])
+def test_what_is_left_of_a_bend_is_its_mean_square_bent_or_straight(
+    size_px: float, sigma_px: float
+) -> None:
+    """A bend is as likely absent as normal of 1 px, or of what exceeds three sigmas of its estimate."""
+    rng = np.random.default_rng([31, round(size_px)])
+    place = rng.random((30, 2)) * [1.0, 0.6] * (np.array(SHAPE) - 1.0)
+    unit = 2.0 * place[:, 1] / (SHAPE[1] - 1.0) - 1.0
+    bend = 1.5 * unit**2 - 0.5
+    misfit = sigma_px * rng.normal(size=(30, 2)) + size_px * bend[:, None]
+    # The image lies where its points are seen.
+    misfit -= np.median(misfit, axis=0)
+    shown = residuals(place, misfit, sigma_px)
+    left_open = bends(shown, np.full((2, 3), 1e-9), SHAPE)
+    quadratic = next(one for one in left_open if (one.kind, one.along) == ("quadratic", "samples"))
+    both_columns = np.column_stack([shown.design, bend])
+    variance = sigma_px**2 * np.linalg.inv(both_columns.T @ both_columns)[3, 3]
+    for k in range(2):
+        estimate = np.linalg.lstsq(both_columns, misfit[:, k], rcond=None)[0][3]
+        expected = max(1.0, estimate**2 - 9.0 * variance)
+        coefficient = np.linspace(-30.0, 30.0, 60_001)
+        bent = 0.5 * norm.pdf(coefficient, 0.0, np.sqrt(expected))
+        likelihood = norm.pdf(estimate, coefficient, np.sqrt(variance))
+        straight = 0.5 * norm.pdf(estimate, 0.0, np.sqrt(variance))
+        step = coefficient[1] - coefficient[0]
+        total = (bent * likelihood).sum() * step + straight
+        mean_square = (coefficient**2 * bent * likelihood).sum() * step / total
+        share = quadratic.variance_px2[k] / (quadratic.variance_px2[k] + variance)
+        assert (share * estimate) ** 2 + share * variance == pytest.approx(mean_square, rel=1e-3)
