@@ -5,11 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from services.adjustment.broken_image import placed_steps
 from services.adjustment.control_observations import ControlObservations
+from services.adjustment.displacement_components import Component
 from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
 from services.quality.accuracy import normalised_error
 from services.quality.normal_law import normal_ce90
 from services.sensors.correction import ImageCorrection, no_correction
+from services.sensors.displacement import DisplacementGrid
 from services.types import Array, IntArray
 from tests.services.conftest import FlatModel
 
@@ -119,6 +122,29 @@ def test_chips_that_a_break_cuts_near_their_middle_are_left_out() -> None:
     active = adjust_scene(FlatModel(), SHAPE, observations).active
     assert not active[apart < 0.2 * CHIP_PX].any()
     assert active[apart > 0.3 * CHIP_PX].mean() > 0.9
+    assert active[(apart > 0.3 * CHIP_PX) & (apart < 0.7 * CHIP_PX)].mean() > 0.5
+
+
+@pytest.mark.parametrize("lost", [150.0, -60.0])
+def test_a_break_is_in_the_middle_of_the_lines_that_are_missing_or_repeated(lost: float) -> None:
+    scene, rng = broken(7, lost)
+    (step,) = adjust_scene(FlatModel(), SHAPE, scene.observed(rng)).components
+    assert step.kind == "break"
+    middle = np.array([[scene.line - 0.5 + lost / 2.0, SHAPE[1] / 2.0]])
+    expected = scene.truth.invert(middle)[0, 0]
+    assert step.at_px + step.length_px / 2.0 == pytest.approx(expected, abs=3.0)
+
+
+def test_lines_end_half_a_pixel_before_the_first_line_behind_a_break() -> None:
+    """Pixel positions are those of the middles of pixels: both sides end between two lines."""
+    nodes = np.array([0.0, 2000.0, 2001.0, SHAPE[0] - 1.0])
+    moved = np.zeros((4, 2, 2))
+    moved[2:, :, 0] = -20.0
+    grid = DisplacementGrid(nodes, np.array([0.0, SHAPE[1] - 1.0]), moved, np.zeros(moved.shape))
+    correction = replace(no_correction(SHAPE), displacement=grid)
+    before = Component("break", 1.0, 2000.0, np.ones(2))
+    (placed,) = placed_steps(np.array([2000]), (before,), correction)
+    assert placed.at_px + placed.length_px / 2.0 == pytest.approx((1999.5 + 2019.5) / 2.0)
 
 
 def test_a_break_where_nothing_moved_costs_little() -> None:
