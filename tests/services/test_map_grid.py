@@ -1,12 +1,15 @@
 """Map grids agree with GDAL and PROJ through rasterio."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rasterio.transform import Affine
 from rasterio.warp import transform
 
+from services.errors import InputError
 from services.geodesy import east_north_up
-from services.map_grid import MapGrid, utm_of
+from services.map_grid import MapGrid, check_map_code, utm_of
 
 a_micropixel = 1e-6
 a_millionth = 1e-6
@@ -84,3 +87,71 @@ def test_positions_outside_the_map_are_nan() -> None:
 )
 def test_every_position_has_its_utm_zone(lon: float, lat: float, zone: str) -> None:
     assert utm_of(lon, lat) == zone
+
+
+def test_a_grid_around_the_whole_earth_has_every_place_once() -> None:
+    earth = MapGrid(
+        "EPSG:4326", np.array([-179.5, 89.5]), np.array([[0.0, 1.0], [-1.0, 0.0]]), (180, 360)
+    )
+    edges = np.array([[90.0, -0.4], [90.0, 0.4], [90.0, 359.4], [90.0, 180.0]])
+    np.testing.assert_allclose(earth.line_sample(earth.lon_lat(edges)), edges, atol=a_micropixel)
+
+
+@pytest.mark.parametrize("grid", [NORTH_UP, ROTATED, DEGREES, UTM_1])
+def test_the_ground_sampling_is_the_side_of_a_square_as_large_as_the_central_pixel(
+    grid: MapGrid,
+) -> None:
+    centre = (np.array(grid.shape) - 1.0) / 2.0
+    corners = centre + np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, 0.5], [0.5, -0.5]])
+    lon_lat_h = np.column_stack([grid.lon_lat(corners), np.zeros(4)])
+    x, y = east_north_up(lon_lat_h, lon_lat_h[0])[:, :2].T
+    area_m2 = 0.5 * abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))
+    assert grid.gsd_m == pytest.approx(np.sqrt(area_m2), rel=1e-4)
+
+
+def test_pixels_reach_half_a_step_around_their_middles() -> None:
+    last = np.array(NORTH_UP.shape) - 1.0
+    inside = np.array([[-0.5, -0.5], last + 0.5, [0.0, last[1] + 0.4]])
+    outside = np.array([[-0.6, 0.0], [0.0, -0.6], [last[0] + 0.6, 0.0], [0.0, last[1] + 0.6]])
+    assert NORTH_UP.contains(inside).all()
+    assert not NORTH_UP.contains(outside).any()
+
+
+def test_a_map_with_heights_is_that_without_them() -> None:
+    with_heights = replace(NORTH_UP, crs="EPSG:32633+5773")
+    lon_lat = NORTH_UP.lon_lat(positions(NORTH_UP))
+    np.testing.assert_allclose(with_heights.lon_lat(positions(NORTH_UP)), lon_lat, atol=1e-12)
+    np.testing.assert_allclose(with_heights.line_sample(lon_lat), NORTH_UP.line_sample(lon_lat))
+    assert not with_heights.is_geographic
+
+
+@pytest.mark.parametrize(
+    ("crs", "north_first"),
+    [("EPSG:4326", True), ("OGC:CRS84", False), ("EPSG:32633", False), ("EPSG:2180", True)],
+)
+def test_the_first_axis_is_that_of_the_reference_system(crs: str, north_first: bool) -> None:
+    assert replace(NORTH_UP, crs=crs).first_axis_is_north == north_first
+
+
+@pytest.mark.parametrize("code", ["EPSG:32633", "ESRI:54009", "EPSG:4326", "OGC:CRS84"])
+def test_codes_of_maps_on_the_earth_are_accepted(code: str) -> None:
+    check_map_code(code)
+
+
+@pytest.mark.parametrize(
+    ("code", "why"),
+    [
+        ("EPSG:999999", "no known reference system"),
+        ("+proj=utm +zone=33", "no known reference system"),
+        ("EPSG:32633+5773", "no known reference system"),
+        ("/etc/passwd", "no known reference system"),
+        ("http://example.org/crs", "no known reference system"),
+        ("PROJ:32633", "no known reference system"),
+        ("EPSG:5773", "has no map coordinates"),
+        ("EPSG:4978", "has no map coordinates"),
+        ("ESRI:104903", "cannot be reached from WGS 84"),
+    ],
+)
+def test_codes_of_something_else_are_refused(code: str, why: str) -> None:
+    with pytest.raises(InputError, match=why):
+        check_map_code(code)
