@@ -7,13 +7,17 @@ from hypothesis import strategies as st
 from pyproj import Geod, Transformer
 
 from services.geodesy import (
+    box_around,
+    continuous,
     east_north_up,
     ecef_from_east_north_up,
     ecef_from_lon_lat_h,
     lon_lat_h_from_east_north_up,
     lon_lat_h_from_ecef,
+    longitudes_near,
     metres_per_degree,
     move_metres,
+    wrapped_degrees,
 )
 from services.types import Array
 
@@ -130,3 +134,33 @@ def test_a_move_in_metres_is_that_of_the_frame_east_north_and_up(height_m: float
         east_north_up(move_metres(at, step_m)[k : k + 1], np.array(expected[k]))[0] for k in range(3)
     ]
     assert np.abs(apart).max() < a_tenth_of_a_millimetre
+
+
+@pytest.mark.parametrize("west", [12.0, 179.9, -180.05])
+def test_the_box_around_points_holds_them_and_runs_counter_clockwise(west: float) -> None:
+    rng = np.random.default_rng(3)
+    lon_lat = np.column_stack([west + rng.uniform(0.0, 0.3, 50), rng.uniform(-0.1, 0.1, 50)])
+    turned = np.column_stack([wrapped_degrees(lon_lat[:, 0]), lon_lat[:, 1]])
+    box = box_around(turned)
+    x, y = box.T
+    area = 0.5 * (np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))
+    outermost = np.ptp(lon_lat, axis=0)
+    assert area == pytest.approx(outermost.prod(), rel=1e-3)
+    inside = longitudes_near(turned[:, 0], float(x.mean()))
+    beyond_m = 111_000.0 * np.array(
+        [inside.min() - x.min(), x.max() - inside.max(), turned[:, 1].min() - y.min()]
+    )
+    assert (beyond_m > 0.05).all()
+    assert (beyond_m < 0.2).all()
+
+
+def test_positions_are_continued_from_the_first_of_them() -> None:
+    lon_lat = np.array([[179.0, 1.0], [-179.0, 2.0], [10.0, 3.0], [-1.5, 4.0]])
+    np.testing.assert_allclose(continuous(lon_lat)[:, 0], [179.0, 181.0, 10.0, 358.5])
+    np.testing.assert_allclose(continuous(lon_lat[::-1])[:, 0], [-1.5, 10.0, -179.0, -181.0])
+    np.testing.assert_allclose(continuous(lon_lat)[:, 1], lon_lat[:, 1])
+
+
+def test_differences_of_longitudes_go_the_short_way_round() -> None:
+    difference = wrapped_degrees(np.array([0.0, 359.0, -359.0, 181.0, -181.0, 540.5]))
+    np.testing.assert_allclose(difference, [0.0, -1.0, 1.0, -179.0, 179.0, -179.5])
