@@ -1,5 +1,7 @@
 """A registered model against ground that had no part in it."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -75,6 +77,33 @@ def test_what_points_and_their_frame_state_is_expected_of_them(registered):
     assert checked(scene, stated).normalised.mean_square == pytest.approx(in_a_frame_of_a_metre)
 
 
+def test_points_known_half_as_well_are_a_quarter_of_the_evidence(
+    registered: Callable[..., Registered],
+) -> None:
+    scene = registered()
+    points = check_points(scene, 40, 0.3, (20.0, 0.0))
+    found = [
+        checked(
+            scene,
+            CheckPoints(points.lon_lat_h, points.line_sample, np.full((40, 3), m), points.sigma_px),
+        ).normalised.mean_square
+        for m in (20.0, 40.0)
+    ]
+    assert found[0] / found[1] == pytest.approx(4.0, rel=1e-2)
+
+
+def test_residuals_twice_as_large_as_stated_are_within_a_limit_of_three(
+    registered: Callable[..., Registered],
+) -> None:
+    scene = registered()
+    good = qualify(scene.adjusted(), QualificationOptions(), np.random.default_rng(3))
+    points = check_points(scene, 200, 1.0)
+    half = CheckPoints(points.lon_lat_h, points.line_sample, points.sigma_m, points.sigma_px / 2.0)
+    judged = with_check_points(good, checked(scene, half), LIMIT)
+    assert judged.verdict == "good"
+    assert judged.criteria[-1].value == pytest.approx(2.0, rel=0.1)
+
+
 def test_marks_without_a_sigma_have_that_of_a_person(registered):
     scene = registered()
     points = check_points(scene, 200, MARKING_SIGMA_PX)
@@ -111,6 +140,15 @@ def test_errors_on_the_ground_are_small_across_180_degrees(registered):
     found_m = check_model(corrected, scene.adjustment, points, UNKNOWN_FRAME).accuracy
     assert max(found_m.rmse_m) < 2.0 * 0.3 * GSD_M
     assert set(np.sign(points.lon_lat_h[:, 0])) == {-1.0, 1.0}
+
+
+def test_a_point_beside_the_scene_leaves_the_others(registered: Callable[..., Registered]) -> None:
+    scene = registered()
+    points = check_points(scene, 40, 0.3)
+    ground = points.lon_lat_h.copy()
+    ground[0] = np.nan
+    result = checked(scene, CheckPoints(ground, points.line_sample, points.sigma_m, points.sigma_px))
+    assert result.accuracy.n == result.residual_px.xy.n == result.normalised.n == 39
 
 
 def test_points_beside_the_scene_are_refused_by_number(registered):
