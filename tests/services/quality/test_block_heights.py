@@ -68,6 +68,20 @@ def test_honest_points_are_found_honest_on_flat_and_on_steep_ground(rise):
     assert found.normalised.mean_square > found.normalised.upper
 
 
+def test_the_variance_of_a_height_is_that_of_the_way_from_the_slope_to_the_point() -> None:
+    """A point goes east and up by one error: what it rises beside the slope is what counts."""
+    rise, sigma_m = 0.4, 0.2
+    terrain = sloping_terrain(rise)
+    points = true_points(terrain, 50, Frame.from_sigmas(1.0, 2.0))
+    root = np.random.default_rng(15).normal(size=(50, 3, 3))
+    points = replace(points, covariance_m2=root @ root.transpose(0, 2, 1))
+    errors = height_errors(points, HeightModel(terrain, sigma_m))
+    assert_allclose(terrain.slope(points.lon_lat_h)[:, 0], rise, rtol=0.01)
+    off = np.column_stack([-terrain.slope(points.lon_lat_h), np.ones(50)])
+    beside = (root.transpose(0, 2, 1) @ off[:, :, None])[:, :, 0]
+    assert_allclose(errors.variance_m2, (beside**2).sum(axis=1) + sigma_m**2, rtol=1e-9)
+
+
 def test_bias_spread_and_le90_put_in_are_found_and_the_frame_is_judged_by_its_own_sigma():
     rng = np.random.default_rng(13)
     terrain = sloping_terrain()
