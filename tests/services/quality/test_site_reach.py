@@ -71,6 +71,16 @@ def test_what_is_declared_for_a_check_holds_the_frames_of_both_sites(
     assert (np.diag(of_control) < 8.0 * np.diag(frame_m2)).all()
 
 
+def test_own_errors_of_the_points_of_a_check_site_average_out(one: Draw, plain: SiteReach) -> None:
+    site, check = one.sites[0], plain.checks[1]
+    own_m2 = site.ground.covariance_m2
+    badly = replace(site, ground=replace(site.ground, covariance_m2=own_m2 + np.eye(3)))
+    after = reach(replace(one, sites=(badly, one.sites[1])))
+    np.testing.assert_allclose(
+        after.checks[1].covariance_m2 - check.covariance_m2, np.eye(3) / check.points, atol=1e-9
+    )
+
+
 def test_corners_of_every_image_move_by_less_than_its_model_was_off(one: Draw, plain: SiteReach) -> None:
     assert len(plain.corners) == 2 * len(one.images)
     of_orthos = [np.hypot(*corner.moved_m.T) for corner in plain.corners if "ortho" in corner.image]
