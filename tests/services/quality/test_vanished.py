@@ -51,6 +51,19 @@ def test_points_that_no_later_scene_finds_have_vanished(rng: np.random.Generator
     assert (vanished.probability[rows] < 1e-3).all()
 
 
+@pytest.mark.parametrize("first", [False, True])
+def test_of_two_scenes_of_one_day_that_which_finds_a_point_counts_as_the_last(
+    rng: np.random.Generator, first: bool
+) -> None:
+    found = rng.random((12, 300)) < 0.95
+    found[4:, 7] = False
+    found[4 if first else 5, 7] = True
+    days = monthly(12)
+    days[5] = days[4]
+    vanished = vanished_points(ground(rng, 300), searched(found, days))
+    assert vanished.missed[vanished.point == 7].tolist() == [6]
+
+
 def test_a_point_that_no_scene_has_ever_found_is_one_of_them(rng: np.random.Generator) -> None:
     found = rng.random((8, 200)) < 0.9
     found[:, 3] = False
