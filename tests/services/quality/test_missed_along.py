@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import hypergeom
 
 from services.quality.lack_of_fit import missed_criterion
 from services.quality.missed_along import missed_along, missed_at_borders
@@ -170,6 +171,30 @@ def test_points_that_are_not_found_or_two_that_disagree_accuse_no_border() -> No
     assert not missed_at_borders(line, np.arange(100) >= 2, all_found, away).any()
     for others in (np.arange(100) >= 3, np.arange(100) < 97):
         np.testing.assert_array_equal(missed_at_borders(line, others, all_found, away), ~others)
+
+
+@pytest.mark.parametrize("run", [3, 4, 6])
+def test_a_border_is_accused_up_to_the_chance_of_drawing_its_points_without_return(run: int) -> None:
+    """Of 80 points as many as chance allows are left out, besides those at the border far from it."""
+    line = np.linspace(0.0, LINES - 1.0, 80)
+    outcomes = []
+    for left_out in range(run, 60):
+        agrees = np.ones(80, dtype=bool)
+        agrees[:run] = False
+        agrees[10 : 10 + left_out - run] = False
+        chance = 4.0 * hypergeom.pmf(run, 80, left_out, run)
+        found = np.ones(80, dtype=bool)
+        missed = missed_at_borders(line, agrees, found, np.tile(AWAY_PX, (80, 1)))
+        assert missed[:run].all() == missed.any() == (chance <= 0.01)
+        outcomes.append(missed.any())
+    assert any(outcomes)
+    assert not all(outcomes)
+
+
+def test_points_that_are_left_out_where_they_are_expected_accuse_no_border() -> None:
+    line = np.linspace(0.0, LINES - 1.0, 100)
+    agrees = np.arange(100) >= 5
+    assert not missed_at_borders(line, agrees, np.ones(100, dtype=bool), np.zeros((100, 2))).any()
 
 
 def test_false_matches_at_a_border_accuse_it_less_than_points_that_are_displaced_alike() -> None:
