@@ -135,6 +135,15 @@ def test_lines_of_sight_end_on_the_ground(incidence_deg: float) -> None:
     np.testing.assert_allclose(model.project(met), pixels_of(), atol=a_thousandth_of_a_pixel)
 
 
+@pytest.mark.parametrize("height_m", [0.0, 512.25, 233.1])
+def test_lines_of_sight_end_on_a_plain_that_is_as_high_everywhere(height_m: float) -> None:
+    """All of the search for the highest ground is done at the height of the ground itself."""
+    plain = Terrain(GRID, ArrayImage(np.full(SHAPE, height_m, dtype=np.float32)))
+    for incidence_deg in (0.0, 35.0):
+        met = intersect_terrain(view(incidence_deg), pixels_of(), plain)
+        np.testing.assert_allclose(met[:, 2], height_m, atol=a_millimetre)
+
+
 def test_a_line_of_sight_ends_on_the_side_of_a_ridge_the_sensor_sees() -> None:
     """On slopes steeper than the line of sight, several points of the ground lie on one line."""
     model, ground = view(40.0), terrain(400.0)
