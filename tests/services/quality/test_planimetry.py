@@ -178,6 +178,18 @@ def test_what_an_ortho_image_states_of_its_details_is_in_the_errors_found_on_it(
 
 
 @pytest.mark.long
+def test_what_a_measure_states_is_in_metres_and_covers_its_scatter() -> None:
+    """Exact points on an exact ortho-image: the measures alone err, of pixels of 2 m."""
+    points, chips = block()
+    exact = replace(points, covariance_m2=np.zeros_like(points.covariance_m2))
+    here = site("west", *WEST)
+    sharp = replace(here, reference=replace(here.reference, sigma_m=0.0))
+    errors = point_errors(exact, chips, sharp)
+    square = np.mean(errors.error_m**2 / np.diagonal(errors.covariance_m2, 0, 1, 2))
+    assert 0.06 < square < 0.3
+
+
+@pytest.mark.long
 def test_a_shift_beyond_the_near_search_is_found_when_the_frame_lets_expect_it() -> None:
     points, chips = block()
     far = Frame.from_sigmas(40.0, 40.0)
