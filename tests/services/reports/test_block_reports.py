@@ -1,0 +1,152 @@
+"""What the reports on plans, adjustments and selections say of a block, from figures that are put in."""
+
+import csv
+import io
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+
+from services.production.block_plan import BlockPlan, PlannedImage, PlannedSite
+from services.production.block_residuals import FITS, ImageFit, PointFits
+from services.production.planning import Accuracy90, Forecast, ImageForecast, ProposedSite
+from services.quality.accuracy_statement import median_accuracy
+from services.reports.block_adjustment import (
+    ALL_FITS,
+    LOOK_AT,
+    AdjustmentReport,
+    ControlFit,
+    adjustment_document,
+)
+from services.reports.block_adjustment import points_csv as points_of_block
+from services.reports.plan import PlanReport, plan_document, points_csv
+from services.reports.selection import share_words
+from services.types import Frame
+
+WHEN = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
+RELATIVE, EARTH = Accuracy90(1.1, 1.2, 1.3, 1.4), Accuracy90(5.1, 5.2, 5.3, 5.4)
+NEAR, FAR = PlannedSite("near", (5.5, 43.25)), PlannedSite("far", (6.5, 43.75))
+
+
+@pytest.fixture(scope="module")
+def plan() -> PlanReport:
+    image = PlannedImage("one", (5.0, 43.0), (1000.0, 1000.0), 2.0, 15.0, 100.0, 6.0)
+    proposed = (
+        ProposedSite(FAR, Accuracy90(4.0, 4.1, 4.2, 4.3), np.array([0.5, 1.1])),
+        ProposedSite(NEAR, Accuracy90(3.5, 3.6, 3.7, 3.8), np.array([0.5, np.nan])),
+    )
+    forecast = Forecast(
+        lon_lat=np.array([[5.0, 43.0], [5.25, 43.5]]),
+        ce90_m=np.array([2.0, 3.0]),
+        le90_m=np.array([7.0, 8.0]),
+        relative=RELATIVE,
+        on_the_earth=EARTH,
+        images=(ImageForecast("one", 7, RELATIVE, EARTH),),
+        groups=1,
+        proposed=proposed,
+    )
+    block = BlockPlan((image,), 500.0, candidates=(NEAR, FAR))
+    return PlanReport("a plan", block, forecast, 1.5, WHEN, "0.1.0")
+
+
+def test_a_plan_states_its_accuracy_relative_first_and_what_each_further_site_gains(
+    plan: PlanReport,
+) -> None:
+    relative, earth, first, second = plan.words
+    assert relative.startswith("Relative to the control points: CE90 1.10 m, LE90 1.20 m on average")
+    assert relative.endswith("worst place 1.30 m, 1.40 m")
+    assert earth.startswith("On the Earth: CE90 5.10 m, LE90 5.20 m on average")
+    assert "far (6.5000, 43.7500): mean CE90 on the Earth 5.10 m to 4.00 m, LE90 4.10 m" in first
+    assert "near (5.5000, 43.2500): mean CE90 on the Earth 4.00 m to 3.50 m, LE90 3.60 m" in second
+
+
+def test_the_document_of_a_plan_names_what_each_candidate_gains(plan: PlanReport) -> None:
+    document = plan_document(plan)
+    assert [one["name"] for one in document["proposed"]] == ["far", "near"]
+    assert document["proposed"][0]["gain_m"] == {"near": 0.5, "far": 1.1}
+    assert document["proposed"][1]["gain_m"] == {"near": 0.5, "far": None}
+    assert document["on_the_earth"]["worst_le90_m"] == 5.4
+    assert document["relative_to_control_points"]["ce90_m"] == 1.1
+    assert (document["points"], document["verdict"]) == (2, "predicted")
+
+
+def test_every_place_of_a_plan_has_its_accuracy_on_the_earth(plan: PlanReport) -> None:
+    rows = list(csv.DictReader(io.StringIO(points_csv(plan))))
+    found = [{name: float(value) for name, value in row.items()} for row in rows]
+    assert found == [
+        {"lon": 5.0, "lat": 43.0, "ce90_m": 2.0, "le90_m": 7.0},
+        {"lon": 5.25, "lat": 43.5, "ce90_m": 3.0, "le90_m": 8.0},
+    ]
+
+
+def adjusted(odd: int = 0, contradicting: int = 0, control: int = 3) -> AdjustmentReport:
+    """A block of four images, some of which are odd, and control, some of which contradicts."""
+    images = tuple(
+        ImageFit(f"image {k}", 10, 9, (0.1, 0.2), (1.0, 2.0), 3.0, "far off" if k < odd else FITS)
+        for k in range(4)
+    )
+    fits = tuple(
+        ControlFit(f"P{k}", k >= contradicting, (0.5, -0.5, float("nan"))) for k in range(control)
+    )
+    return AdjustmentReport(
+        block="b",
+        accuracy=median_accuracy(1.0, 2.0, Frame.from_sigmas(3.0, 4.0)),
+        delivered_px=9.0,
+        adjusted_px=0.3,
+        points_px=0.2,
+        slope_factor=1.5,
+        images=images,
+        control=fits,
+        lon_lat_h=np.array([[5.0, 43.0, 100.0], [6.0, 44.0, 200.0]]),
+        sigma_m=np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]),
+        points=PointFits(np.array([3, 4]), np.array([2, 4]), np.array([0.1, 0.2]), np.array([0.3, 0.4])),
+        finished_at=WHEN,
+        software_version="0.1.0",
+    )
+
+
+@pytest.mark.parametrize(
+    ("odd", "contradicting", "control", "verdict", "words"),
+    [
+        (0, 0, 3, ALL_FITS, "Every image fits, and so does all control."),
+        (0, 0, 0, ALL_FITS, "Every image fits."),
+        (1, 0, 3, LOOK_AT, "1 of 4 images should be looked at."),
+        (0, 2, 3, LOOK_AT, "2 of 3 control points contradict the rest."),
+        (
+            3,
+            1,
+            3,
+            LOOK_AT,
+            "3 of 4 images should be looked at and 1 of 3 control points contradict the rest.",
+        ),
+    ],
+)
+def test_a_block_is_looked_at_for_each_odd_image_and_each_contradiction(
+    odd: int, contradicting: int, control: int, verdict: str, words: str
+) -> None:
+    report = adjusted(odd, contradicting, control)
+    assert (report.verdict, report.verdict_words) == (verdict, words)
+    assert [one.name for one in report.left_out] == [f"P{k}" for k in range(contradicting)]
+
+
+def test_the_document_of_an_adjustment_has_residuals_before_and_after_and_no_unknown_height() -> None:
+    document = adjustment_document(adjusted())
+    assert document["residuals_px"] == {"delivered": 9.0, "adjusted": 0.3, "points": 0.2}
+    assert document["control"][0]["misfit_m"] == [0.5, -0.5, None]
+    assert document["on_the_earth"]["le90_m"] > document["relative_to_control_points"]["le90_m"]
+
+
+def test_the_points_of_a_block_have_their_sigmas_by_east_north_and_up() -> None:
+    rows = list(csv.DictReader(io.StringIO(points_of_block(adjusted()))))
+    assert [float(rows[1][f"sigma_{axis}_m"]) for axis in ("east", "north", "up")] == [4.0, 5.0, 6.0]
+    assert [float(rows[1][name]) for name in ("lon", "lat", "h_m")] == [6.0, 44.0, 200.0]
+    assert [int(rows[0][name]) for name in ("id", "images", "used")] == [0, 3, 2]
+    assert [float(rows[0][name]) for name in ("rms_px", "largest_px")] == [0.1, 0.3]
+
+
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [(0.0, "0.0 %"), (1e-6, "less than 0.1 %"), (0.0006, "0.1 %"), (0.5, "50.0 %"), (1.0, "100.0 %")],
+)
+def test_a_share_that_is_not_nothing_never_looks_like_it(share: float, words: str) -> None:
+    assert share_words(share) == words
