@@ -169,3 +169,14 @@ def test_a_chip_shows_the_mean_of_what_lies_under_it_where_lines_and_samples_mov
 def test_no_correction_changes_nothing() -> None:
     at = np.array([[0.0, 0.0], [123.0, 456.0]])
     np.testing.assert_allclose(no_correction(SHAPE).apply(at), at, rtol=0.0, atol=a_nanopixel)
+
+
+def test_no_position_has_less_variance_than_what_parts_of_the_image_are_off_by() -> None:
+    """What the affine parameters share with a displacement is taken off its variance, at most all."""
+    line, sample = (np.array([0.0, size - 1.0]) for size in SHAPE)
+    grid = DisplacementGrid(line, sample, np.zeros((2, 2, 2)), np.full((2, 2, 2), -5.0))
+    moved = replace(no_correction(SHAPE), displacement=grid)
+    covariance = np.zeros((6, 6))
+    covariance[0, 0], covariance[3, 3] = 4.0, 9.0
+    (at_centre,) = moved.covariance_at(moved.centre[None, :], covariance, np.array([0.5, 2.0]))
+    np.testing.assert_allclose(at_centre, np.diag([0.5**2, 9.0 - 5.0 + 2.0**2]))
