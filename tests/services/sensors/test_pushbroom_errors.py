@@ -31,6 +31,14 @@ def with_a_mirror(model: PushbroomModel) -> PushbroomModel:
     return replace(model, look=replace(model.look, coefficients=look))
 
 
+def with_a_bent_detector(model: PushbroomModel) -> PushbroomModel:
+    """The same whose detectors look farther ahead towards the right, by 20 px at its border."""
+    look, half = model.look.coefficients.copy(), np.diff(model.look.breaks)[:, None] / 2.0
+    pixel = np.ptp(model.look(np.array([0.0, SHAPE[1] - 1.0]))[:, 1]) / SHAPE[1]
+    look[:, :1, -2] += 20.0 * pixel * half / (SHAPE[1] / 2.0)
+    return replace(model, look=replace(model.look, coefficients=look))
+
+
 def ground_in(model: PushbroomModel, count: int = 60) -> np.ndarray:
     rng = np.random.default_rng(11)
     return model.locate(rng.uniform(0.0, 1.0, (count, 2)) * SHAPE, rng.uniform(0.0, 1500.0, count))
@@ -38,8 +46,13 @@ def ground_in(model: PushbroomModel, count: int = 60) -> np.ndarray:
 
 @pytest.mark.parametrize(
     "model",
-    [a_model(), a_model(250.0), replace(a_model(), light_path=LightPath(True, True, True))],
-    ids=["east", "west", "light"],
+    [
+        a_model(),
+        a_model(250.0),
+        replace(a_model(), light_path=LightPath(True, True, True)),
+        with_a_bent_detector(a_model()),
+    ],
+    ids=["east", "west", "light", "bent"],
 )
 @pytest.mark.parametrize("term", range(len(TERMS)), ids=TERMS)
 def test_derivatives_agree_with_differences_of_exact_models(model: PushbroomModel, term: int) -> None:
@@ -106,3 +119,33 @@ def test_a_displaced_satellite_sees_the_ground_displaced_the_other_way() -> None
     found = moved.locate(position, ground[:, 2])
     step = ecef_from_lon_lat_h(found) - ecef_from_lon_lat_h(ground)
     np.testing.assert_allclose(np.linalg.norm(step, axis=1), 30.0, rtol=0.02)
+
+
+def test_anisotropy_moves_nothing_along_the_track() -> None:
+    """Of detectors that look ahead, the focal length makes both tangents longer, anisotropy one."""
+    model = with_a_bent_detector(a_model())
+    samples = np.column_stack([np.full(3, 1500.0), [0.0, 1000.0, SHAPE[1] - 1.0]])
+    before = model.look(samples[:, 1])
+    central = model.look(np.array([(SHAPE[1] - 1.0) / 2.0]))
+    for term, grown in (("focal length", [1e-3, 1e-3]), ("anisotropy", [0.0, 1e-3])):
+        terms = np.zeros(len(TERMS))
+        terms[TERMS.index(term)] = 1e-3
+        after = PushbroomErrors(model).corrected(terms).look(samples[:, 1])
+        np.testing.assert_allclose(after - before, (before - central) * grown, atol=1e-12)
+
+
+@pytest.mark.parametrize("drift", [False, True])
+def test_the_orbit_moves_ahead_to_the_right_and_upwards(drift: bool) -> None:
+    model = a_model()
+    last = np.array([[SHAPE[0] - 1.0 if drift else (SHAPE[0] - 1.0) / 2.0, 1000.0]])
+    origin = model.line_of_sight(last)[0][0]
+    up = origin / np.linalg.norm(origin)
+    velocity = model.orbit.derivative(model.line_time(last[:, 0])[:, 0])[0]
+    right = np.cross(velocity, up) / np.linalg.norm(np.cross(velocity, up))
+    names = ("along-track drift", "across-track drift", "radial drift")
+    names = names if drift else ("along track", "across track", "radial")
+    for name, axis in zip(names, (np.cross(up, right), right, up), strict=True):
+        terms = np.zeros(len(TERMS))
+        terms[TERMS.index(name)] = 5.0
+        moved = PushbroomErrors(model).corrected(terms).line_of_sight(last)[0][0] - origin
+        np.testing.assert_allclose(moved, 5.0 * axis, atol=0.02)
