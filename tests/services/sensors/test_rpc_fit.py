@@ -11,6 +11,7 @@ from services.sensors.pushbroom import PushbroomModel
 from services.sensors.rpc import check_rpc, cubic_terms
 from services.sensors.rpc_fit import fit_rpc, fit_to_ground
 from services.simulation.orbit import pushbroom_over
+from services.types import Array
 
 HEIGHTS_M = (50.0, 850.0)
 a_hundredth_of_a_pixel = 0.01
@@ -43,6 +44,27 @@ def test_an_rpc_fits_a_pushbroom_within_a_thousandth_of_a_pixel(shape: tuple[int
 def test_the_range_of_heights_is_that_of_the_fit() -> None:
     fit = fit_rpc(a_pushbroom((300, 400)), (300, 400), HEIGHTS_M)
     assert fit.model.height_range_m == pytest.approx(HEIGHTS_M)
+
+
+class OfHeights:
+    """A pushbroom that has no ground beyond its heights."""
+
+    def __init__(self, base: PushbroomModel) -> None:
+        self.base = base
+        self.height_range_m = HEIGHTS_M
+        self.project = base.project
+        self.project_derivative = base.project_derivative
+        self.line_of_sight = base.line_of_sight
+
+    def locate(self, line_sample: Array, height_m: Array) -> Array:
+        ground = self.base.locate(line_sample, height_m)
+        beyond = (height_m < HEIGHTS_M[0] - 1e-6) | (height_m > HEIGHTS_M[1] + 1e-6)
+        return np.where(beyond[:, None], np.nan, ground)
+
+
+def test_no_ground_is_needed_beyond_the_heights_of_the_fit() -> None:
+    shape = (300, 400)
+    assert fit_rpc(OfHeights(a_pushbroom(shape)), shape, HEIGHTS_M).max_error_px < 0.001
 
 
 def test_an_rpc_is_fitted_across_the_antimeridian() -> None:
