@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from services.adjustment.block_scale import posterior_scale
+from services.adjustment.block_scale import low_scale, magnitude, posterior_scale, robust_scale
 from services.adjustment.control_ground import ControlGround, joined_ground
 from services.types import Frame, IntArray
 
@@ -59,3 +59,56 @@ def test_what_the_points_of_a_block_share_is_an_error_of_its_frame_as_control() 
     frame = Frame(np.diag([4.0, 4.0, 9.0]), np.diag([1.0, 2.0, 3.0]))
     (as_control,) = control(np.arange(3), frame).frame_covariances()
     np.testing.assert_allclose(as_control, np.diag([5.0, 6.0, 12.0]))
+
+
+def residuals_of_rays(rng: np.random.Generator, rays: int, points: int, wrong: float) -> np.ndarray:
+    """Squared residuals (n,) of points that are intersected from rays, a share of which is 30 off."""
+    squares = []
+    for _ in range(points):
+        basis = np.linalg.qr(rng.normal(size=(2 * rays, 3)))[0]
+        error = NOISE * rng.normal(size=2 * rays)
+        error += np.repeat(rng.random(rays) < wrong, 2) * rng.uniform(-30.0, 30.0, 2 * rays)
+        squares.append(((error - basis @ (basis.T @ error)).reshape(-1, 2) ** 2).sum(axis=1))
+    return np.concatenate(squares)
+
+
+@pytest.mark.parametrize(("rays", "tolerance"), [(3, 0.25), (6, 0.12)])
+def test_both_first_scales_are_that_of_the_noise_where_nothing_is_wrong(
+    rays: int, tolerance: float
+) -> None:
+    """Three rays share their six values unevenly, of which three are left."""
+    rng = np.random.default_rng([6, rays])
+    point, coordinates = np.repeat(np.arange(600), rays), np.full(600, 3.0)
+    square = residuals_of_rays(rng, rays, 600, 0.0)
+    assert low_scale(square, point, coordinates) == pytest.approx(NOISE, rel=tolerance)
+    assert robust_scale(square, point, coordinates) == pytest.approx(NOISE, rel=0.04)
+
+
+def test_a_tenth_of_wrong_rays_makes_no_first_scale_twice_as_large() -> None:
+    rng = np.random.default_rng(7)
+    point, coordinates = np.repeat(np.arange(600), 6), np.full(600, 3.0)
+    square = residuals_of_rays(rng, 6, 600, 0.1)
+    for scale in (low_scale(square, point, coordinates), robust_scale(square, point, coordinates)):
+        assert NOISE < scale < 2.0 * NOISE
+
+
+def test_the_scale_of_few_long_residuals_is_that_of_the_others() -> None:
+    """A tenth of the points has residuals that are ten times as long: they count as long ones do."""
+    rng = np.random.default_rng(8)
+    point, coordinates = np.repeat(np.arange(600), 4), np.full(600, 3.0)
+    square = residuals_of_rays(rng, 4, 600, 0.0)
+    clean = posterior_scale(square, point, coordinates, 0.0)
+    assert clean == pytest.approx(NOISE, rel=0.04)
+    square[point < 60] *= 100.0
+    assert clean < posterior_scale(square, point, coordinates, 0.0) < 1.3 * clean
+
+
+def test_residuals_of_points_with_few_and_many_rays_are_of_one_size() -> None:
+    rng = np.random.default_rng(9)
+    sizes = []
+    for rays in (2, 3, 8):
+        point, coordinates = np.repeat(np.arange(800), rays), np.full(800, 3.0)
+        square = residuals_of_rays(rng, rays, 800, 0.0)
+        size = magnitude(square, point, np.ones(len(point), dtype=np.bool_), coordinates)
+        sizes.append(np.sqrt(np.mean(size**2) / 2.0))
+    np.testing.assert_allclose(sizes, np.sqrt(0.5) * NOISE, rtol=0.06)
