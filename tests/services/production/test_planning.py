@@ -18,7 +18,7 @@ from services.production.block_plan import (
     plan_geometry,
 )
 from services.production.planning import block_of, forecast
-from services.quality.normal_law import normal_ce90
+from services.quality.normal_law import LINEAR_LE90, normal_ce90
 from services.sensors.correction import CorrectedModel
 from services.types import Array
 
@@ -124,6 +124,29 @@ def test_the_proposed_site_is_the_best_of_all_in_the_adjustment() -> None:
     assert int(np.nanargmax(proposal.gain_m)) == int(np.argmin(means_m))
     np.testing.assert_allclose(proposal.on_the_earth.ce90_m, min(means_m), rtol=0.1)
     assert proposal.on_the_earth.ce90_m < found.on_the_earth.ce90_m
+
+
+def test_the_accuracy_on_the_earth_is_that_of_each_place_with_the_frame_of_the_block() -> None:
+    plan = replace(PLAN, candidates=())
+    geometry, found = plan_geometry(plan), forecast(plan)
+    block = block_of(plan, geometry, [0])
+    relative_m2 = block.point_covariance_m2[(geometry.site < 0) & (block.group >= 0)]
+    earth_m2 = relative_m2 + block.frames[0].covariance_m2
+    np.testing.assert_allclose(found.ce90_m, normal_ce90(earth_m2[:, :2, :2]))
+    np.testing.assert_allclose(found.le90_m, LINEAR_LE90 * np.sqrt(earth_m2[:, 2, 2]))
+    np.testing.assert_allclose(found.relative.ce90_m, normal_ce90(relative_m2[:, :2, :2]).mean())
+    np.testing.assert_allclose(found.on_the_earth.worst_le90_m, found.le90_m.max())
+
+
+def test_a_place_that_one_image_shows_is_not_determined_by_a_known_height() -> None:
+    geometry = plan_geometry(MIXED)
+    block = block_of(MIXED, geometry, [0])
+    rays = np.bincount(geometry.observations.point, minlength=len(geometry.lon_lat_h))
+    alone = (rays == 1) & (geometry.site < 0)
+    assert alone.sum() > 20
+    assert (block.group[alone] == -1).all()
+    assert np.isnan(block.point_covariance_m2[alone]).all()
+    assert (block.group[(rays > 1) & (geometry.site < 0)] == 0).all()
 
 
 def test_a_larger_base_gives_better_heights_and_more_points_a_better_shape() -> None:
