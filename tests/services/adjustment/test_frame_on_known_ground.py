@@ -100,6 +100,18 @@ def test_known_ground_stays_as_far_off_as_the_others_predict_of_it(row: int, axi
         assert np.delete(active, row).all()
 
 
+@pytest.mark.parametrize("row", [0, 1, 2])
+def test_a_wrong_point_takes_no_other_of_its_source_with_it(row: int) -> None:
+    """What leaves at first comes back. Of two points alone, nothing says which of both is wrong."""
+    for axis in range(3):
+        for size_m in np.arange(4.0, 12.0, 0.5).tolist():
+            off_m = np.zeros((COUNT, 3))
+            off_m[row, axis] = size_m
+            active = fit_frame(BLOCK, known_ground(off_m), PLACE, OF_FOUND).active
+            assert active.sum() >= COUNT - 1
+            assert active[2:].all() or row >= 2
+
+
 def test_a_coordinate_that_nobody_knows_counts_nothing() -> None:
     off_m = drawn(7)
     known = known_ground(off_m)

@@ -146,13 +146,13 @@ def test_the_verdict_is_the_worst_outcome() -> None:
 
 def test_the_figures_of_a_block_are_those_of_its_median_point_and_survive_a_document() -> None:
     points = control_points(301, np.random.default_rng(63), BOX)
-    sigma_m = np.linspace(0.5, 2.0, 301)
+    sigma_m = 1.25 * np.geomspace(0.5, 2.0, 301)
     covariance_m2 = sigma_m[:, None, None] ** 2 * np.diag([1.0, 1.0, 4.0])
     points = replace(points, covariance_m2=covariance_m2)
     figures = block_quality(points, np.full(301, 3), rectangle(*BOX))
     assert figures.sigma_horizontal_m.median == pytest.approx(1.25)
     assert figures.sigma_up_m.median == pytest.approx(2.5)
-    assert figures.sigma_up_m.p90 == pytest.approx(3.7)
+    assert figures.sigma_up_m.p90 == pytest.approx(2.5 * 0.5 * 4.0**0.9)
     assert figures.points_per_km2 == pytest.approx(301 / (16.27 * 11.11), rel=0.01)
     statement = block_accuracy(figures, Frame.from_sigmas(3.0, 6.0))
     relative, earth = statement.relative_to_control_points, statement.on_the_earth
