@@ -1,7 +1,7 @@
 """Figures of a block cell by cell: what was put in is found, and a cell that misses is named."""
 
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from services.formats.block.document import rectangle
 from services.quality.block_cells import block_cells, images_per_point, view_ages_years
 from services.quality.density import cell_of_points, covered_area_km2, density_cells
-from services.types import Array, ControlPoints
+from services.types import Acquisition, Array, ControlPoints
 from tests.factories import control_points
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
@@ -98,3 +98,20 @@ def test_the_age_of_a_point_is_that_of_its_newest_dated_view():
     without = replace(points, views=replace(points.views, images=undated))
     assert np.isnan(view_ages_years(without, NOW)).all()
     assert_array_equal(images_per_point(points), [3, 3, 3, 3])
+
+
+def test_the_age_of_a_cell_is_the_mean_of_both_middle_ages_of_an_even_number() -> None:
+    """Four points in one cell, each in an image of its own, and three in the next."""
+    lon_lat = np.array([[5.02, 43.05]] * 4 + [[5.15, 43.05]] * 3)
+    points = points_at(lon_lat)
+    years = np.array([1.0, 8.0, 4.0, 5.0, 2.0, 9.0, 3.0])
+    taken = tuple(
+        Acquisition(f"IMG_{k}", acquired_at=NOW - timedelta(days=365.25 * age))
+        for k, age in enumerate(years.tolist())
+    )
+    count = np.diff(points.views.start)
+    views = replace(points.views, image=np.repeat(np.arange(7), count), images=taken)
+    cells = block_cells(replace(points, views=views), rectangle(5.0, 43.0, 5.2, 43.1), 2, NOW)
+    assert_allclose(cells.age_years, [4.5, 3.0])
+    assert_array_equal(cells.images, [1.0, 1.0])
+    assert_array_equal(cells.short_of_views, [4, 3])

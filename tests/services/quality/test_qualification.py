@@ -1,5 +1,6 @@
 """The figures of a qualification against a registration whose truth is known, and its verdicts."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from services.quality.qualification import (
 )
 from services.quality.stability import measure_stability
 from services.types import Frame
-from tests.services.conftest import GSD_M
+from tests.services.conftest import GSD_M, Registered
 
 a_millionth_px = 1e-6
 DEFAULT = QualificationOptions()
@@ -211,6 +212,20 @@ def test_each_threshold_costs_its_verdict(registered, field, limit, lost):
     result = qualified(registered(), replace(in_pixels, **{field: limit}))
     assert failed(result) == {lost}
     assert result.verdict == ("usable" if lost[1] == "good" else "failed")
+
+
+def test_many_points_are_usable_although_many_others_disagree(
+    registered: Callable[..., Registered],
+) -> None:
+    """Of few points most must agree, of many more than are needed for a good scene half."""
+    scene = registered(n=90, lost=0, wrong=35)
+    share = scene.measures.active.sum() / scene.measures.matched.sum()
+    assert DEFAULT.good_active_of_matched < share < DEFAULT.usable_active_of_few
+    assert scene.measures.active.sum() > DEFAULT.good_active_points
+    lost = failed(qualified(scene))
+    assert not lost & {("active_of_matched", "usable"), ("active_of_matched", "good")}
+    many = replace(DEFAULT, good_active_points=1000)
+    assert ("active_of_matched", "usable") in failed(qualified(scene, many))
 
 
 def test_what_points_of_three_metres_are_known_to_give_is_good(registered):
