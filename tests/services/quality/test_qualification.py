@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from services.errors import NotEnoughPoints
+from services.quality.cell_stability import measure_cell_stability
 from services.quality.criteria import verdict_of, verdict_scope
 from services.quality.normal_law import CIRCULAR_CE90
 from services.quality.predicted import predict_accuracy
@@ -15,10 +16,11 @@ from services.quality.qualification import (
     count_points,
     image_coverage,
     qualify,
+    qualify_repeated,
     second_consensus_share,
     unexplained_px,
 )
-from services.quality.stability import measure_stability
+from services.quality.stability import measure_stability, stability_of
 from services.types import Frame
 from tests.services.conftest import GSD_M, Registered
 
@@ -212,6 +214,53 @@ def test_each_threshold_costs_its_verdict(registered, field, limit, lost):
     result = qualified(registered(), replace(in_pixels, **{field: limit}))
     assert failed(result) == {lost}
     assert result.verdict == ("usable" if lost[1] == "good" else "failed")
+
+
+def test_the_place_that_moves_most_when_points_are_held_out_counts(
+    registered: Callable[..., Registered],
+) -> None:
+    scene = registered().adjusted()
+    stability = measure_stability(scene, 5, 0.8, np.random.default_rng(1))
+    still = [replace(one, median_px=0.01) for one in stability.displacements]
+    for place in range(5):
+        moved = (*still[:place], replace(still[place], median_px=9.0), *still[place + 1 :])
+        shown = replace(stability, displacements=moved)
+        result = qualify_repeated(scene, DEFAULT, shown, measure_cell_stability(scene))
+        values = {one.value for one in result.criteria if one.name == "displacement_px"}
+        assert values == {9.0}
+
+
+def test_displacements_are_of_the_repetition_along_samples_and_lines(
+    registered: Callable[..., Registered],
+) -> None:
+    scene = registered(lost=0, wrong=0).adjusted()
+    correction = scene.adjustment.correction
+    line_px, sample_px = 3.0, -1.0
+    shift = np.array([[line_px, 0.0, 0.0], [sample_px, 0.0, 0.0]])
+    moved = replace(correction, parameters=correction.parameters + shift)
+    shown = stability_of(scene, 0.8, [(np.arange(5), replace(scene.adjustment, correction=moved))])
+    for place in shown.displacements:
+        assert (place.x_m, place.y_m) == pytest.approx((sample_px * GSD_M, line_px * GSD_M))
+        assert place.max_m == pytest.approx(np.hypot(line_px, sample_px) * GSD_M)
+    measures = scene.measures
+    left_px = (measures.line_sample - moved.apply(measures.predicted))[:5].mean(axis=0)
+    assert shown.held_out_px.y.mean == pytest.approx(left_px[0])
+    assert shown.held_out_px.x.mean == pytest.approx(left_px[1])
+    assert shown.group_means.rms_px == pytest.approx(np.hypot(*left_px))
+
+
+@pytest.mark.monte_carlo
+def test_means_of_points_that_are_held_out_are_what_independent_errors_give(
+    registered: Callable[..., Registered],
+) -> None:
+    means = [
+        measure_stability(
+            registered(n=200, lost=0, wrong=0, seed=seed).adjusted(), 10, 0.8, np.random.default_rng(2)
+        ).group_means
+        for seed in range(6)
+    ]
+    assert 0.8 < np.mean([one.over_independent for one in means]) < 1.2
+    assert 0.8 < np.mean([one.over_stated for one in means]) < 1.2
 
 
 def test_many_points_are_usable_although_many_others_disagree(
