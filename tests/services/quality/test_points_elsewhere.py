@@ -99,6 +99,24 @@ def test_detectors_that_alternate_leave_no_place_that_is_the_scenes(seed: int) -
     assert "detectors that alternate" in criterion.note
 
 
+@pytest.mark.parametrize(("few", "others", "needed_for"), [(3, 12, "good"), (12, 60, "usable")])
+def test_few_points_of_some_samples_are_of_them_by_chance(
+    few: int, others: int, needed_for: str
+) -> None:
+    """Of 15 points three are neighbours in one of ten cases, of 72 twelve never."""
+    line = np.concatenate([np.linspace(200.0, 1800.0, few), np.linspace(0.0, 1999.0, others)])
+    beside = np.linspace(0.0, 999.0, others)
+    beside = np.where(beside < 500.0, 0.9 * beside, 1000.0 - 0.9 * (1000.0 - beside))
+    sample = np.concatenate([np.linspace(470.0, 530.0, few), beside])
+    order = np.random.default_rng(4).permutation(others)
+    line[few:] = line[few:][order]
+    line_sample = np.column_stack([line, sample])
+    elsewhere = Elsewhere(np.arange(few), np.array([2.0, 9.0]), 10.0, 1e-5)
+    criterion = elsewhere_criterion(elsewhere, line_sample, np.arange(few + others) >= few, (2000, 1000))
+    assert criterion.needed_for == needed_for
+    assert ("a detector is out of place" in criterion.note) == (needed_for == "usable")
+
+
 def test_a_round_area_that_moved_is_neither() -> None:
     rng = np.random.default_rng(9)
     for _ in range(50):
