@@ -84,6 +84,15 @@ def behind_breaks(line: list[float], followed: bool = True) -> Criterion:
     return breaks_criterion(BREAKS, np.array(line), followed, LINES)
 
 
+def test_a_swing_is_told_by_its_largest_displacement() -> None:
+    """A wave of 1 px reaches 1 px at its crests, and 0.71 px in the root mean square."""
+    phase = np.linspace(0.0, 2.0 * np.pi, 1000, endpoint=False)
+    size_px = np.array([np.sin(phase).std(), 3.0 * np.sin(phase).std()])
+    structure = Structure("samples", 1e-9, "period", 800.0, size_px, 9.0, np.full(2, np.nan))
+    (criterion,) = structure_criteria([structure], SIGHT, SHAPE, PREDICTED_PX)
+    assert "1.00 px in line and 3.00 px in sample" in criterion.note
+
+
 def test_parts_of_a_broken_image_that_points_hold_are_good() -> None:
     held = behind_breaks([10, 200, 400, 600, 900, 1400, 1600, 1700, 1900])
     assert held.met
