@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from services.quality.accuracy_statement import points_accuracy, scene_accuracy
+from services.quality.accuracy_statement import (
+    accuracy_document,
+    median_accuracy,
+    no_accuracy,
+    points_accuracy,
+    scene_accuracy,
+    vertices_accuracy,
+)
 from services.quality.frames import frame_in_image
 from services.quality.normal_law import normal_ce90
 from services.types import UNKNOWN_FRAME, Frame
@@ -70,3 +77,46 @@ def test_the_words_say_what_is_unknown_and_why():
         "the control points' frame"
     )
     assert np.isnan(block.on_the_earth.le90_m)
+
+
+def test_vertices_are_stated_by_the_worst_and_the_median_of_those_that_are_known() -> None:
+    relative_m, earth_m = np.array([1.0, 2.0, np.nan, 4.0]), np.array([3.0, 5.0, np.nan, 9.0])
+    stated = vertices_accuracy(relative_m, earth_m, TILTED)
+    assert (stated.relative_to_control_points.ce90_m, stated.on_the_earth.ce90_m) == (4.0, 9.0)
+    assert stated.lines == (
+        "Relative to the control points: CE90 4.00 m (worst vertex), 2.00 m (median vertex)",
+        "On the Earth: CE90 9.00 m (worst vertex), 5.00 m (median vertex)",
+    )
+
+
+def test_vertices_of_a_scene_that_is_not_registered_have_the_accuracy_of_its_model_alone() -> None:
+    unknown = np.full(2, np.nan)
+    stated = vertices_accuracy(unknown, np.array([20.0, 30.0]), None)
+    assert stated.words == {
+        "Relative to the control points": "none: the scene is not registered",
+        "On the Earth": "CE90 30.00 m (worst vertex), 25.00 m (median vertex)",
+    }
+    assert (
+        "nobody stated the accuracy of its model" in vertices_accuracy(unknown, unknown, None).lines[1]
+    )
+    in_no_frame = vertices_accuracy(np.array([1.0]), unknown[:1], UNKNOWN_FRAME).lines[1]
+    assert in_no_frame == "On the Earth: CE90 unknown: nobody stated the frame of the control points"
+
+
+def test_the_median_point_of_a_block_is_stated_without_and_with_its_frame() -> None:
+    stated = median_accuracy(3.0, 6.0, Frame.from_sigmas(4.0, 8.0))
+    ce90_of_one, le90_of_one = np.sqrt(2.0 * np.log(10.0)), 1.6449
+    for one, times in ((stated.relative_to_control_points, 3.0), (stated.on_the_earth, 5.0)):
+        assert one.ce90_m == pytest.approx(ce90_of_one * times, rel=1e-4)
+        assert one.le90_m == pytest.approx(le90_of_one * 2.0 * times, rel=1e-4)
+        assert "median of the points" in one.words
+
+
+def test_a_figure_that_is_unknown_is_null_in_a_document() -> None:
+    document = accuracy_document(scene_accuracy(1.0, np.nan, UNKNOWN_FRAME))
+    assert document["relative_to_control_points"]["ce90_m"] == 1.0
+    assert document["on_the_earth"]["ce90_m"] is None
+    assert document["on_the_earth"]["le90_m"] is None
+    assert "nobody stated the frame" in str(document["on_the_earth"]["words"])
+    failed = accuracy_document(no_accuracy("no point was found"))
+    assert {one["words"] for one in failed.values()} == {"none: no point was found"}
