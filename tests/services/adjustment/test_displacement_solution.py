@@ -7,7 +7,12 @@ import pytest
 from scipy.linalg import null_space
 from scipy.stats import multivariate_normal
 
-from services.adjustment.displacement_components import MAX_CHANCE, Component, likeliest_components
+from services.adjustment.displacement_components import (
+    MAX_CHANCE,
+    Component,
+    likeliest_components,
+    unit_variance,
+)
 from services.adjustment.displacement_solution import by_affine, solve_displacement
 from services.adjustment.structure import Residuals, structures
 from services.sensors.correction import no_correction
@@ -147,3 +152,25 @@ def test_a_correction_is_the_conditional_law_of_what_moves_the_image() -> None:
         np.testing.assert_allclose(found, expected, atol=1e-6)
         variance_px2 = ((t @ solution.covariance[k]) * t).sum(axis=1) + grid.variance_at(places)[:, k]
         np.testing.assert_allclose(variance_px2, np.diagonal(own - gain @ between.T), atol=1e-6)
+
+
+@pytest.mark.monte_carlo
+def test_errors_that_neighbours_share_in_all_directions_are_no_motion_of_lines_or_samples() -> None:
+    """Over a fifth of the image: most of these draws look like bows or steps along an axis."""
+    bent = 0
+    for seed in range(10):
+        residuals = measures(seed, 120)
+        place = residuals.line_sample
+        apart = np.linalg.norm(place[:, None] - place[None], axis=2)
+        root = np.linalg.cholesky(np.exp(-apart / (0.2 * EXTENT_PX)) + 1e-9 * np.eye(120))
+        shared = 1.5 * root @ np.random.default_rng([8, seed]).normal(size=(120, 2))
+        patchy = replace(residuals, misfit=residuals.misfit + shared)
+        bent += bool(likeliest_components(patchy, EXTENT_PX)[0])
+    assert bent <= 1
+
+
+@pytest.mark.monte_carlo
+def test_the_variance_of_unit_weight_is_one_of_few_points_as_well() -> None:
+    assert np.mean([unit_variance(measures(seed, 15)) for seed in range(300)]) == pytest.approx(
+        1.0, abs=0.05
+    )
