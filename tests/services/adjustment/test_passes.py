@@ -1,0 +1,53 @@
+"""Images of a pass share a part of the errors of their shifts, and a covariance covers two others."""
+
+import numpy as np
+import pytest
+
+from services.adjustment.block_accuracy import positive_part
+from services.adjustment.parameters import block_priors, image_parameters, sharing_covariance
+from tests.services.conftest import SHAPE, FlatModel
+
+SIGMAS_PX = 3.0, 5.0, 2.0
+IMAGES = [
+    image_parameters(f"image {k}", FlatModel(), SHAPE, shift_px=sigma_px, slope_px=1.0)
+    for k, sigma_px in enumerate(SIGMAS_PX)
+]
+PASS = np.array([True, False, True])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_shifts_of_a_pass_have_a_share_of_their_variances_in_common(share: float) -> None:
+    """An error on the ground moves images of one view by as much, in units of their sigmas."""
+    covariance = sharing_covariance(IMAGES, PASS, share)
+    between = share * SIGMAS_PX[0] * SIGMAS_PX[2] * np.eye(2)
+    own = [sigma_px**2 * np.eye(2) for sigma_px in (SIGMAS_PX[0], SIGMAS_PX[2])]
+    np.testing.assert_allclose(covariance, np.block([[own[0], between], [between, own[1]]]), atol=1e-9)
+
+
+def test_the_priors_of_a_pass_are_those_of_images_that_share_half_and_of_others_alone() -> None:
+    priors = block_priors(IMAGES, [PASS])
+    tells = np.concatenate([image.locating for image in IMAGES])
+    covariance = np.linalg.inv(priors.locating.toarray()[np.ix_(tells, tells)])
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), np.repeat(SIGMAS_PX, 2))
+    correlation = covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+    same_axis = correlation[0::2, 0::2]
+    np.testing.assert_allclose(same_axis, [[1.0, 0.0, 0.5], [0.0, 1.0, 0.0], [0.5, 0.0, 1.0]], atol=1e-9)
+
+
+def test_drifts_that_are_found_twice_as_large_have_four_times_the_variance() -> None:
+    priors = block_priors(IMAGES, [])
+    twice = priors.with_slopes(2.0)
+    slopes = priors.estimated
+    np.testing.assert_allclose(1.0 / twice.shape[slopes], 4.0 / priors.shape[slopes])
+    np.testing.assert_array_equal(twice.shape[~slopes], priors.shape[~slopes])
+
+
+def test_a_covariance_with_the_positive_part_of_a_difference_covers_both() -> None:
+    rng = np.random.default_rng(81)
+    for _ in range(20):
+        one, other = (root @ root.T for root in rng.normal(size=(2, 4, 4)))
+        covered = one + positive_part(other - one)
+        for part in (one, other):
+            assert np.linalg.eigvalsh(covered - part).min() > -1e-9
+        np.testing.assert_allclose(positive_part(one), one, atol=1e-9)
+        np.testing.assert_allclose(positive_part(-one), 0.0, atol=1e-9)
