@@ -127,6 +127,15 @@ def test_the_slope_is_the_rise_per_metre() -> None:
     np.testing.assert_allclose(plane.slope(lon_lat), expected, atol=1e-3)
 
 
+def test_the_slope_beside_a_ridge_is_that_of_its_side() -> None:
+    """It is over one posting of 10 m: the other side begins a posting away."""
+    _, sample = np.indices(SHAPE)
+    ridge = Terrain(GRID, ArrayImage((500.0 - 3.0 * np.abs(sample - 140.0)).astype(np.float32)))
+    places = GRID.lon_lat(np.array([[150.0, 139.0], [150.0, 141.0]]))
+    slope = np.linalg.norm(ridge.slope(places), axis=1)
+    np.testing.assert_allclose(slope, 0.3, rtol=0.01)
+
+
 @pytest.mark.parametrize("incidence_deg", [0.0, 12.0, 35.0])
 def test_lines_of_sight_end_on_the_ground(incidence_deg: float) -> None:
     model, ground = view(incidence_deg), terrain(60.0)
