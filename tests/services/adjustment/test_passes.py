@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 from services.adjustment.block_accuracy import positive_part
+from services.adjustment.bundle import adjust_block
 from services.adjustment.parameters import block_priors, image_parameters, sharing_covariance
 from tests.services.conftest import SHAPE, FlatModel
+from tests.services.simulated import ring_of_geometries
+from tests.services.ties import make_ties
 
 SIGMAS_PX = 3.0, 5.0, 2.0
 IMAGES = [
@@ -51,3 +54,18 @@ def test_a_covariance_with_the_positive_part_of_a_difference_covers_both() -> No
             assert np.linalg.eigvalsh(covered - part).min() > -1e-9
         np.testing.assert_allclose(positive_part(one), one, atol=1e-9)
         np.testing.assert_allclose(positive_part(-one), 0.0, atol=1e-9)
+
+
+def test_the_frame_of_a_block_of_one_pass_is_no_better_than_that_of_an_image() -> None:
+    """Nobody states how much images of a pass share: all of it, at worst, so that none averages out."""
+    geometries = ring_of_geometries(5)
+    observations = make_ties(geometries, np.random.default_rng(82), 60, 0.2).observations
+    images = [
+        image_parameters(g.plan.image_id, g.rpc, g.plan.shape, shift_px=4.0, order="shift")
+        for g in geometries
+    ]
+    apart, together = (
+        adjust_block(images, observations, passes=passes).frames[0].sigma_m
+        for passes in ((), (np.ones(5, dtype=np.bool_),))
+    )
+    assert 0.85 * np.sqrt(5.0) < together / apart < 1.15 * np.sqrt(5.0)
