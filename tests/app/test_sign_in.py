@@ -9,6 +9,7 @@ from fastapi.testclient import TestClient
 
 from app.api import session_cookie
 from app.api.session_cookie import COOKIE, LIFETIME_S, format_session
+from app.main import create_app
 from app.usecases.features.items import page_secret
 from tests.statements import run_sql
 
@@ -44,6 +45,16 @@ def test_the_cookie_is_short_lived_and_out_of_reach_of_scripts_and_other_sites(c
         assert {"httponly", "samesite=lax", "path=/", f"max-age={LIFETIME_S}"} <= words
         assert ("secure" in words) == is_secure
         assert secret not in cookie
+
+
+def test_behind_a_proxy_the_cookie_is_sent_to_this_service_and_to_no_other_of_its_host(settings, token):
+    with TestClient(create_app(settings), root_path="/points") as client:
+        made = client.post("/sign-in", data={"token": token("read")}, follow_redirects=False)
+        ended = client.post("/sign-out", follow_redirects=False)
+    for reply in (made, ended):
+        words = {word.strip().lower() for word in reply.headers["set-cookie"].split(";")}
+        assert "path=/points/" in words
+        assert reply.headers["location"] == "http://testserver/points/"
 
 
 def test_a_session_changes_nothing(signed_in, connection):

@@ -141,6 +141,13 @@ def test_scopes_are_kept_once_each_in_the_order_of_their_power(connection):
     assert (token.name, token.scopes) == ("survey office", ("read", "admin"))
 
 
+def test_all_scopes_are_listed_the_lesser_ones_first_however_they_were_given(connection):
+    ordered = ("read", "register", "monitor", "admin")
+    for number, given in enumerate((ordered, ordered[::-1], ("admin", "monitor", "read", "register"))):
+        token = create_token(connection, f"survey office {number}", given).token
+        assert token.scopes == ordered
+
+
 @pytest.mark.parametrize("end", ["revoked_at = now()", "expires_at = now() - interval '1 s'"])
 def test_a_name_is_taken_as_long_as_its_token_is_valid(connection, end):
     first = create_token(connection, "survey office", ["read"], days=1)
