@@ -4,6 +4,7 @@ import json
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import jwt
@@ -239,6 +240,107 @@ def test_a_document_of_another_issuer_or_of_any_size_is_not_used(settings, issue
     large = Issuer(settings.model_copy(update={"oidc_issuer": issuer.url}))
     with pytest.raises(NotAllowed):
         large.identify(issuer.token()["Authorization"].split()[1])
+
+
+def token_of(issuer: LocalIssuer, **claims: object) -> str:
+    """A token of an issuer, without the header around it."""
+    return issuer.token(**claims)["Authorization"].split()[1]
+
+
+@pytest.mark.parametrize(("size_bytes", "used"), [(1 << 10, True), (2 << 20, False)])
+def test_keys_are_read_from_a_document_of_limited_size(settings, issuer, size_bytes, used):
+    issuer.more["x5c_of_somebody"] = "x" * size_bytes
+    one = Issuer(settings.model_copy(update={"oidc_issuer": issuer.url}))
+    if used:
+        assert one.identify(token_of(issuer)).name == "Survey office"
+    else:
+        with pytest.raises(NotAllowed):
+            one.identify(token_of(issuer))
+
+
+@dataclass
+class Clock:
+    """The clock of a service, which a test moves.
+
+    Attributes:
+        ahead_s: of the real one.
+    """
+
+    ahead_s: float = 0.0
+
+    def monotonic(self) -> float:
+        """Seconds, as of `time.monotonic`."""
+        return time.monotonic() + self.ahead_s
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """The clock by which an issuer's keys grow old."""
+    clock = Clock()
+    monkeypatch.setattr(oidc, "time", clock)
+    return clock
+
+
+def end_of_requests_for_keys() -> None:
+    """Wait until no keys are being fetched."""
+    for thread in threading.enumerate():
+        if thread.name == "oidc":
+            thread.join(20.0)
+
+
+def test_keys_are_fetched_again_every_ten_minutes_so_that_new_ones_serve(settings, issuer, clock):
+    one = Issuer(settings.model_copy(update={"oidc_issuer": issuer.url}))
+    by_former_key = token_of(issuer)
+    one.identify(by_former_key)
+    issuer.key = ec.generate_private_key(ec.SECP256R1())
+    for clock.ahead_s in (0.0, 300.0, 590.0):
+        one.identify(by_former_key)
+        end_of_requests_for_keys()
+    assert issuer.asked.count("/keys") == 1
+    clock.ahead_s = 610.0
+    one.identify(by_former_key)
+    end_of_requests_for_keys()
+    assert issuer.asked.count("/keys") == 2
+    assert one.identify(token_of(issuer)).name == "Survey office"
+    with pytest.raises(NotAllowed):
+        one.identify(by_former_key)
+
+
+def test_keys_serve_for_an_hour_while_their_issuer_does_not_answer(settings, issuer, clock):
+    one = Issuer(settings.model_copy(update={"oidc_issuer": issuer.url}))
+    one.identify(token_of(issuer))
+    issuer.server.shutdown()
+    issuer.server.server_close()
+    for clock.ahead_s in (700.0, 1400.0, 3500.0):
+        one.identify(token_of(issuer))
+        end_of_requests_for_keys()
+        one.identify(token_of(issuer))
+    clock.ahead_s = 3700.0
+    with pytest.raises(NotAllowed):
+        one.identify(token_of(issuer))
+
+
+def test_few_callers_wait_for_keys_that_do_not_arrive_and_the_others_are_refused_at_once(
+    settings, issuer
+):
+    """Each of them occupies a thread of the service."""
+    one = Issuer(settings.model_copy(update={"oidc_issuer": issuer.url}))
+    issuer.answering.clear()
+    release = threading.Timer(6.0, issuer.answering.set)
+    with ThreadPoolExecutor(oidc.MOST_WAITING) as callers:
+        waiting = [callers.submit(one.identify, token_of(issuer)) for _ in range(oidc.MOST_WAITING)]
+        while not issuer.asked:
+            time.sleep(0.01)
+        time.sleep(0.5)
+        assert not any(caller.done() for caller in waiting)
+        release.start()
+        started = time.monotonic()
+        with pytest.raises(NotAllowed):
+            one.identify(token_of(issuer))
+        assert time.monotonic() - started < 3.0
+        issuer.answering.set()
+        assert {caller.result().name for caller in waiting} == {"Survey office"}
+    release.cancel()
 
 
 def test_one_subject_of_two_issuers_is_two_identities(settings, issuer):
