@@ -133,6 +133,14 @@ def test_only_administrators_give_priorities(client: TestClient, bearer):
     assert (beyond.status_code, "amers:priority" in beyond.json()["detail"]) == (422, True)
 
 
+def test_nobody_else_gives_a_priority_below_the_usual_one_either(client: TestClient, bearer):
+    execute, me = "/processes/register-scene/execution", bearer("register")
+    scene = client.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100), headers=me).json()["id"]
+    for priority, status in ((-1, 403), (0, 201)):
+        body = {"inputs": {"scene": scene}, "amers:priority": priority}
+        assert client.post(execute, json=body, headers=me).status_code == status
+
+
 def test_an_owner_at_his_limit_waits_and_others_go_on(connection: Connection):
     greedy, other = owner_named(connection, "greedy"), owner_named(connection, "other")
     flood(connection, greedy, 10)
@@ -206,6 +214,42 @@ def test_a_repeated_attempt_waits_for_its_delay(connection: Connection):
     assert [row["same"] for row in scheduled] == [True], "a ticket that came earlier would be spent"
     run_sql(connection, "update job set not_before = now()")
     assert claim(connection).id == delayed
+
+
+def test_whoever_owns_a_job_that_is_not_due_it_is_not_claimed_before(connection: Connection):
+    owners = (None, owner_named(connection, "one"), owner_named(connection, "two"))
+    for owner in owners:
+        ask(connection, owner)
+        job = claim(connection)
+        attempts.try_again(connection, job.id, job.attempt, 3600.0)
+    assert attempts.claim_next(connection, "w", LEASE_S) is None
+    run_sql(connection, "update job set priority = 50")
+    for owner in owners:
+        run_sql(
+            connection,
+            "update job set not_before = now(), priority = 0 where owner is not distinct from %s",
+            [owner],
+        )
+        job = claim(connection)
+        assert job.owner == owner
+        assert attempts.claim_next(connection, "w", LEASE_S) is None, "the others are not due"
+        run_sql(connection, "update job set priority = 50")
+        attempts.try_again(connection, job.id, job.attempt, 3600.0)
+
+
+def test_the_next_job_of_an_owner_is_called_when_one_has_lost_too_many_workers(connection: Connection):
+    owner = owner_named(connection, "one")
+    lost, waiting = ask(connection, owner), ask(connection, owner)
+    assert claim(connection, 1).id == lost
+    run_sql(connection, "delete from procrastinate_jobs")
+    run_sql(
+        connection,
+        "update job set lease_until = now() - interval '1 s', failures = %s where id = %s",
+        [FAILURES_ALLOWED - 1, lost],
+    )
+    assert attempts.take_back(connection, FAILURES_ALLOWED) == [lost]
+    assert tickets(connection) == 1
+    assert claim(connection, 1).id == waiting
 
 
 def test_jobs_at_the_limit_need_no_lost_tickets_and_others_get_them(database: Database):

@@ -143,6 +143,15 @@ def test_a_job_that_has_ended_is_not_dismissed(database: Database):
         assert jobs.dismiss(connection, waiting.id)
 
 
+def test_a_job_that_fails_keeps_what_it_made_all_the_same(database: Database):
+    job = claimed(database, new_job(database).id)
+    made = {"verdict": "failed", "files": {"report.json": f"results/{job.id}/1/report.json"}}
+    with database.transaction() as connection:
+        attempts.fail(connection, job.id, 1, {"title": "Not enough points"}, made)
+    ended = state_of(database, job.id)
+    assert (ended.state, ended.results, ended.error) == ("failed", made, {"title": "Not enough points"})
+
+
 def test_a_job_that_outlives_too_many_workers_fails(database: Database):
     job = new_job(database)
     for _ in range(FAILURES_ALLOWED):

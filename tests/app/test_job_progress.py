@@ -1,6 +1,7 @@
 """Progress of jobs: messages, the expected end, and the removal of old results."""
 
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
+from typing import Any
 from uuid import UUID, uuid4
 
 from fastapi.testclient import TestClient
@@ -112,6 +113,69 @@ def test_a_waiting_job_is_expected_after_those_before_it_shared_by_the_workers(c
     ended = jobs.find(connection, done_in(connection, 1))
     assert ended is not None
     assert progress.outlook(connection, ended.id) == Outlook(None, None)
+
+
+def test_neither_failures_nor_jobs_long_past_tell_how_long_a_job_takes(connection, monkeypatch):
+    monkeypatch.setattr(progress, "PAST_JOBS", 3)
+    for seconds in (1000, 1000, 1000, 100, 100, 100):
+        done_in(connection, seconds)
+    for _ in range(4):
+        failed = begun(connection)
+        attempts.fail(connection, failed.id, failed.attempt, {"title": "Not enough points"})
+    assert abs(wait_of(connection, begun(connection)) - timedelta(seconds=100)) < a_slow_machine
+
+
+def test_a_job_that_takes_longer_than_usual_brings_no_other_one_forward(connection: Connection):
+    done_in(connection, 100)
+    late, waiting = begun(connection), asked(connection)
+    run_sql(
+        connection,
+        "update job set claimed_at = claimed_at - interval '1000 s' where id = %s",
+        [late.id],
+    )
+    assert abs(wait_of(connection, late)) < a_slow_machine
+    assert abs(wait_of(connection, waiting) - timedelta(seconds=100)) < a_slow_machine
+
+
+def test_another_attempt_begins_later_and_the_job_when_the_first_one_did(connection: Connection):
+    first = begun(connection)
+    attempts.report(connection, first.id, 1, 40, "looking for points")
+    attempts.try_again(connection, first.id, 1, 0.0)
+    second = claim(connection, first.id, "w", LEASE_S)
+    assert second is not None
+    assert (second.attempt, second.progress, second.started_at) == (2, 0, first.started_at)
+    assert first.claimed_at is not None
+    assert second.claimed_at is not None
+    assert second.claimed_at > first.claimed_at
+
+
+def test_jobs_are_listed_by_how_long_they_took_and_when_they_were_asked_for(connection: Connection):
+    day = datetime(2026, 3, 1, tzinfo=UTC)
+    for number, seconds in enumerate((10, 100, 1000)):
+        job = done_in(connection, seconds)
+        run_sql(
+            connection,
+            "update job set started_at = claimed_at, created_at = %s where id = %s",
+            [day + timedelta(days=number), job],
+        )
+    made = jobs.newest(connection, None, JobFilter(), 10)
+    long, middle, short = made
+    still_running = begun(connection)
+    run_sql(
+        connection,
+        "update job set started_at = now() - interval '400 s', created_at = %s where id = %s",
+        [day + timedelta(days=9), still_running.id],
+    )
+
+    def listed(**wanted: Any) -> list[UUID]:
+        return [job.id for job in jobs.newest(connection, None, JobFilter(**wanted), 10)]
+
+    assert listed(min_duration_s=100) == [still_running.id, long.id, middle.id]
+    assert listed(max_duration_s=100) == [middle.id, short.id]
+    assert listed(min_duration_s=390, max_duration_s=900) == [still_running.id]
+    assert listed(since=middle.created_at) == [still_running.id, long.id, middle.id]
+    assert listed(until=middle.created_at) == [middle.id, short.id]
+    assert listed(since=middle.created_at, until=middle.created_at) == [middle.id]
 
 
 def test_jobs_of_one_transaction_wait_in_the_order_of_the_queue(connection: Connection):
