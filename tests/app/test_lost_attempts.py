@@ -168,6 +168,20 @@ def test_an_attempt_learns_by_its_progress_that_it_lost_its_job(
     assert reached == []
 
 
+def test_a_job_has_all_of_its_progress_when_it_has_succeeded_and_not_before(
+    database, settings, job, process
+):
+    seen = []
+
+    def work_on(work: Work) -> None:
+        work.progress(1.0, "nearly there")
+        seen.append(state_of(database, job.id).progress)
+
+    process(work_on)
+    do_attempt(database, settings, job.id, job.attempt)
+    assert [*seen, state_of(database, job.id).progress] == [99, 100]
+
+
 def reserved_bytes(database: Database, job: Job) -> int:
     with database.transaction() as connection:
         row = run_sql(connection, "select results_bytes from job where id = %s", [job.id]).fetchone()
@@ -192,6 +206,30 @@ def test_the_room_of_the_last_attempt_is_given_back_by_itself_alone_and_once_it_
     assert reserved_bytes(database, job) == 1000
     release(heir)
     assert reserved_bytes(database, job) == 0
+
+
+def test_the_room_of_an_attempt_is_not_that_of_the_next_one(database, job):
+    with database.transaction() as connection:
+        attempts.reserve_results(connection, job.id, job.attempt, 1000)
+    taken_over(database, job)
+    assert reserved_bytes(database, job) == 0
+
+
+def test_room_that_an_attempt_has_while_it_runs_or_for_its_results_is_not_lost(database, job):
+    def lost() -> dict[UUID, int]:
+        with database.transaction() as connection:
+            return attempts.lost_reservations(connection)
+
+    with database.transaction() as connection:
+        attempts.reserve_results(connection, job.id, job.attempt, 1000)
+    assert lost() == {}
+    given_back(database, job)
+    assert lost() == {job.id: job.attempt}
+    claimed(database, job.id)
+    with database.transaction() as connection:
+        attempts.reserve_results(connection, job.id, 2, 1000)
+        attempts.succeed(connection, job.id, 2, {"files": {}})
+    assert lost() == {}
 
 
 LEASE_S = 0.6

@@ -15,7 +15,7 @@ from app.request_context import Origin, working_for
 from app.storage import Storage
 from app.usecases.results import result_key
 from app.usecases.tokens import create_token
-from app.worker.sweep import sweep_records
+from app.worker.sweep import sweep_files, sweep_records
 from tests.app.job_queue import claim
 from tests.statements import run_sql
 
@@ -93,6 +93,91 @@ def test_results_then_jobs_are_removed_by_default_and_the_registration_stays(
     with database.transaction() as connection:
         row = run_sql(connection, "select job_id, files, verdict from registration").fetchone()
     assert row == {"job_id": None, "files": {}, "verdict": "good"}
+
+
+def failed_job(database: Database, storage: Storage) -> UUID:
+    """A registration job that failed and left a file of 100 bytes all the same."""
+    with database.transaction() as connection:
+        job = jobs.create(connection, "register-scene", {})
+        assert job is not None
+        assert claim(connection, job.id)
+        key = storage.put(f"results/{job.id}/1/report.json", [bytes(100)]).key
+        attempts.reserve_results(connection, job.id, 1, 100)
+        attempts.fail(connection, job.id, 1, {"title": "no"}, {"files": {"report.json": key}})
+    return job.id
+
+
+def test_the_files_of_a_job_that_failed_stay_for_their_days_and_are_removed_after_them(
+    database: Database, storage: Storage, settings: Settings
+):
+    job_id = failed_job(database, storage)
+    service_runs(database, 89)
+    sweep_records(database, storage, settings)
+    sweep_files(database, storage, settings.job_seconds)
+    assert len(storage.keys("results")) == 1
+    service_runs(database, 2)
+    sweep_records(database, storage, settings)
+    assert storage.keys("results") == []
+    failed = find(database, job_id)
+    assert failed is not None
+    assert failed.results_removed_at is not None
+
+
+def test_results_are_removed_once(database: Database, storage: Storage, settings: Settings):
+    job_id = successful_job(database, storage)
+    service_runs(database, 91)
+    sweep_records(database, storage, settings)
+    removed = find(database, job_id)
+    sweep_records(database, storage, settings)
+    assert find(database, job_id) == removed
+
+
+def test_what_is_left_of_removed_results_is_given_up(
+    database: Database, storage: Storage, settings: Settings
+):
+    """The files of a job whose removal broke off after its row was written."""
+    job_id = successful_job(database, storage)
+    service_runs(database, 91)
+    sweep_records(database, storage, settings)
+    storage.put(f"results/{job_id}/1/report.json", [bytes(100)])
+    sweep_files(database, storage, settings.job_seconds)
+    assert storage.keys("results") == []
+
+
+def test_the_oldest_jobs_are_deleted_first(
+    database: Database, storage: Storage, settings: Settings, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(jobs, "MOST_DELETED", 2)
+    ended = []
+    with database.transaction() as connection:
+        for _ in range(4):
+            job = jobs.create(connection, "register-scene", {})
+            assert job is not None
+            jobs.dismiss(connection, job.id)
+            ended.append(job.id)
+    service_runs(database, 400)
+    sweep_records(database, storage, settings)
+    assert [find(database, job_id) is None for job_id in ended] == [True, True, False, False]
+
+
+def test_a_job_that_goes_on_is_not_deleted_with_those_that_have_ended(database: Database):
+    with database.transaction() as connection:
+        made = [jobs.create(connection, "register-scene", {}) for _ in range(3)]
+        waiting, running, ended = (job.id for job in made if job is not None)
+        assert claim(connection, running)
+        jobs.dismiss(connection, ended)
+        assert jobs.delete_ended(connection, [waiting, running, ended]) == [ended]
+
+
+def test_a_size_that_is_recorded_meanwhile_is_not_replaced_by_a_measured_one(database: Database):
+    with database.transaction() as connection:
+        job = jobs.create(connection, "register-scene", {})
+        assert job is not None
+        for before, after in ((None, 7), (100, 100)):
+            run_sql(connection, "update job set results_bytes = %s", [before])
+            jobs.set_measured(connection, job.id, 7)
+            row = run_sql(connection, "select results_bytes from job").fetchone()
+            assert row == {"results_bytes": after}
 
 
 def test_jobs_with_files_stay_when_results_are_kept_for_ever(
