@@ -127,6 +127,29 @@ def test_the_same_request_with_the_same_key_creates_one_job(
     assert stranger["jobID"] != first["jobID"], "keys are each owner's own"
 
 
+def test_a_key_stands_for_all_of_its_request(client: TestClient, me: dict[str, str], scene: str):
+    keyed = me | {"Idempotency-Key": "k1"}
+    report = {"outputs": {"report.json": {"transmissionMode": "value"}}}
+    body = {"inputs": {"scene": scene}, **report, "response": "raw"}
+    first = client.post(EXECUTE, json=body, headers=keyed)
+    assert client.post(EXECUTE, json=body, headers=keyed).json()["jobID"] == first.json()["jobID"]
+    by_reference = {"outputs": {"report.json": {"transmissionMode": "reference"}}}
+    for change in ({"response": "document"}, {"outputs": {}}, by_reference):
+        reply = client.post(EXECUTE, json={**body, **change}, headers=keyed)
+        assert reply.status_code == 422, change
+        assert "send a new key" in reply.json()["detail"]
+
+
+def test_a_request_that_is_repeated_with_its_key_is_no_further_job(
+    settings: Settings, me: dict[str, str], scene: str
+):
+    body, keyed = {"inputs": {"scene": scene}}, me | {"Idempotency-Key": "k1"}
+    with TestClient(create_app(settings.model_copy(update={"quota_jobs": 1}))) as client:
+        first = client.post(EXECUTE, json=body, headers=keyed).json()
+        assert client.post(EXECUTE, json=body, headers=me).status_code == 429
+        assert client.post(EXECUTE, json=body, headers=keyed).json()["jobID"] == first["jobID"]
+
+
 def test_concurrent_requests_with_one_key_create_one_job(
     client: TestClient, me: dict[str, str], scene: str
 ):

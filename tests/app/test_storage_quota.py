@@ -20,7 +20,7 @@ from app.db import engine, usage
 from app.db.engine import Connection, Database
 from app.db.jobs import attempts, jobs
 from app.db.tokens import Token
-from app.errors import TooLarge
+from app.errors import TooLarge, TooMany
 from app.storage import Storage, open_storage
 from app.usecases import quotas, results
 from app.usecases.blocks import lifecycle
@@ -306,6 +306,22 @@ def test_what_a_token_reserves_is_counted_after_what_it_reserves_at_once(
             second.rollback()
     with database.transaction() as second:
         count(second, me)
+
+
+def test_a_token_may_fill_its_own_quota_to_the_last_byte_and_a_quota_of_nothing_allows_nothing(
+    settings: Settings, connection: Connection
+):
+    """The quotas of the settings are large: they are not those of these tokens."""
+    some = create_token(connection, "some", ["register"], storage_quota_bytes=100, job_quota=1).token
+    none = create_token(connection, "none", ["register"], storage_quota_bytes=0, job_quota=0).token
+    assert quotas.require_room(connection, settings, some.id, "the image", 100) == 100
+    quotas.require_free_job(connection, settings, some)
+    for owner, size_bytes in ((some, 101), (none, 1), (none, None)):
+        with pytest.raises(TooLarge, match=f"of {owner.storage_quota_bytes} bytes"):
+            quotas.require_room(connection, settings, owner.id, "the image", size_bytes)
+    assert quotas.room_left(connection, settings, none.id) == 0
+    with pytest.raises(TooMany, match="0 open jobs of 0 allowed"):
+        quotas.require_free_job(connection, settings, none)
 
 
 @pytest.mark.thorough
