@@ -6,6 +6,7 @@ import socket
 from base64 import b64encode
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from uuid import UUID
 
 import pytest
 from fastapi.testclient import TestClient
@@ -13,11 +14,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.config import Settings
-from app.db import engine, scenes
-from app.errors import InputError
+from app.db import engine, scenes, usage
+from app.db.engine import Connection, Database
+from app.errors import InputError, TooLarge
 from app.main import create_app
 from app.storage import KEY, Storage
-from app.usecases.scenes import clean_name, folder_of
+from app.usecases.installation import Installation
+from app.usecases.scenes import SentFile, clean_name, folder_of, upload_scene
+from app.usecases.tokens import create_token
 from app.worker.sweep import sweep_files
 from tests.app.conftest import stored_files
 from tests.app.running_service import running_service
@@ -206,6 +210,49 @@ def test_a_removed_scene_keeps_its_record_and_loses_its_files(
     assert stored_files(storage) == []
     late = client.put(f"{here}/files/a_RPC.TXT", content=b"x", headers=me)
     assert late.status_code == 409
+
+
+def test_a_removed_scene_takes_and_gives_no_more_files_and_counts_for_nobody(
+    client: TestClient, bearer: Bearer, connection: Connection, storage: Storage
+):
+    """Not even those that a deletion has left which broke off."""
+    me = bearer("register")
+    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()["id"]
+    model = f"/scenes/{scene}/files/a_RPC.TXT"
+    announced = {"filename": "b_RPC.TXT", "scene": scene}
+    owner = UUID(client.get("/tokens/self", headers=me).json()["id"])
+    assert client.put(model, content=b"LINE_OFF: 1", headers=me).status_code == 200
+    assert client.get(model, headers=me).content == b"LINE_OFF: 1"
+    before = usage.read_usage(connection, owner)
+    assert (before.scenes, before.scene_bytes) == (1, len(TIFF) + 11)
+    connection.commit()
+    assert client.delete(f"/scenes/{scene}", headers=me).status_code == 204
+    for name in ("a_RPC.TXT", "a.tif"):
+        storage.put(f"scenes/{scene}/{name}", [b"left"])
+        assert client.get(f"/scenes/{scene}/files/{name}", headers=me).status_code == 404
+    assert client.put(model, content=b"LINE_OFF: 2", headers=me).status_code == 409
+    words = (f"{name} {b64encode(of.encode()).decode()}" for name, of in announced.items())
+    headers = me | {
+        "Tus-Resumable": "1.0.0",
+        "Upload-Length": "1",
+        "Upload-Metadata": ",".join(words),
+    }
+    assert client.post("/uploads", headers=headers).status_code == 409
+    after = usage.read_usage(connection, owner)
+    assert (after.scenes, after.total_bytes) == (0, 0)
+
+
+@pytest.mark.parametrize("announced", [len(TIFF) - 1, len(TIFF) + 1])
+def test_a_file_of_another_size_than_announced_leaves_nothing(
+    settings: Settings, database: Database, storage: Storage, connection: Connection, announced: int
+):
+    owner = create_token(connection, "me", ["register"]).token
+    connection.commit()
+    sent = SentFile("a.tif", [TIFF], size_bytes=announced)
+    with pytest.raises((InputError, TooLarge)):
+        upload_scene(Installation(database, storage, settings), owner, sent)
+    assert stored_files(storage) == []
+    assert usage.read_usage(connection, owner.id).total_bytes == 0
 
 
 def test_folders_in_a_sent_file_name_are_dropped(client: TestClient, bearer: Bearer, storage: Storage):

@@ -22,11 +22,14 @@ from tusclient.client import TusClient
 
 from app.config import Settings
 from app.db import engine
+from app.db.engine import Connection
+from app.db.tokens import list_tokens
 from app.db.uploads import LIFE_HOURS
+from app.errors import Conflict, InputError, NotFound
 from app.main import create_app
 from app.storage import Storage
 from app.usecases.blocks.uploads import find_uploaded_block
-from app.usecases.uploads import remove_abandoned_uploads
+from app.usecases.uploads import UPLOAD_PREFIX, remove_abandoned_uploads
 from app.worker.sweep import sweep_files
 from tests.app.conftest import stored_files
 from tests.app.point_history import let_pass
@@ -380,12 +383,56 @@ def test_a_block_that_has_arrived_is_there_to_be_ingested(
     reply = begun(client, admin, 100, filename="block.zip", purpose="block")
     url = reply.headers["location"]
     assert piece(client, url, admin, 0, bytes(100)).status_code == 204
-    from app.db.tokens import list_tokens
-
     with engine.connect(dsn) as connection:
         caller = list_tokens(connection)[0]
         key = find_uploaded_block(connection, caller, UUID(url.rsplit("/", 1)[-1]))
     assert storage.size(key) == 100
+
+
+def test_a_complete_upload_is_not_ended_with_its_scene(
+    client: TestClient, me: dict[str, str], storage: Storage
+):
+    url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
+    scene = piece(client, url, me, 0, TIFF).headers["amers-scene"]
+    assert client.delete(url, headers=me).status_code == 409
+    assert client.get(f"/scenes/{scene}", headers=me).status_code == 200
+    assert storage.keys("scenes") == [f"scenes/{scene}/a.tif"]
+
+
+def test_a_block_is_ingested_from_a_complete_archive_of_ones_own(
+    client: TestClient, bearer: Bearer, connection: Connection
+):
+    admin, me = bearer("admin") | TUS, bearer("register") | TUS
+    callers = {token.scopes[0]: token for token in list_tokens(connection)}
+
+    def id_of(url: str) -> UUID:
+        return UUID(url.rsplit("/", 1)[-1])
+
+    arriving = begun(client, admin, 40, filename="block.zip", purpose="block").headers["location"]
+    with pytest.raises(Conflict, match="not complete"):
+        find_uploaded_block(connection, callers["admin"], id_of(arriving))
+    assert piece(client, arriving, admin, 0, bytes(40)).status_code == 204
+    key = find_uploaded_block(connection, callers["admin"], id_of(arriving))
+    assert key == f"uploads/{id_of(arriving)}/block.zip"
+    with pytest.raises(NotFound):
+        find_uploaded_block(connection, callers["register"], id_of(arriving))
+    image = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
+    assert piece(client, image, me, 0, TIFF).status_code == 204
+    for caller in callers.values():
+        with pytest.raises(InputError, match="purpose image"):
+            find_uploaded_block(connection, caller, id_of(image))
+
+
+def test_what_a_complete_upload_has_left_beside_its_file_is_removed(
+    client: TestClient, me: dict[str, str], storage: Storage
+):
+    arriving = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
+    complete = begun(client, me, len(TIFF), filename="b.tif").headers["location"]
+    assert piece(client, complete, me, 0, TIFF).status_code == 204
+    name = f"{UPLOAD_PREFIX}{complete.rsplit('/', 1)[-1]}"
+    (storage.scratch() / name).write_bytes(b"left by a service that was killed")
+    assert remove_abandoned_uploads(client.app.state.database, storage) == [name]  # type: ignore[attr-defined]
+    assert client.head(arriving, headers=me).headers["upload-offset"] == "0"
 
 
 def test_archives_are_stored_and_swept_alike_however_they_were_uploaded(
