@@ -45,6 +45,15 @@ def test_a_file_is_found_in_a_bucket_as_it_was_put(storage: Storage, tmp_path: P
     assert unfinished(storage) == []
 
 
+def test_a_file_that_is_moved_has_its_new_key_alone(storage: Storage):
+    storage.put("scenes/moved/a", [b"one"])
+    storage.move("scenes/moved/a", "trash/moved/a")
+    assert (storage.keys("scenes/moved"), storage.keys("trash/moved")) == ([], ["trash/moved/a"])
+    storage.move("scenes/moved/a", "trash/moved/a")
+    with storage.open("trash/moved/a") as file:
+        assert file.read() == b"one"
+
+
 def test_a_file_of_many_parts_arrives_whole(storage: Storage, tmp_path: Path):
     data = np.random.default_rng(1).bytes(SEVERAL_PARTS)
     path = tmp_path / "large"

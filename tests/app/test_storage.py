@@ -1,12 +1,15 @@
 """Files by key: complete or absent, limited in size, and never outside the folder."""
 
+import errno
 import hashlib
 import io
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from datetime import date
+from dataclasses import dataclass
+from datetime import date, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.errors import DamagedFile, InputError, NotFound, TooLarge
-from app.storage import Storage, StoredChips, chips_key, trash
+from app.storage import RangeReader, Storage, StoredChips, chips_key, trash
 from app.storage.trash import Moment
 from app.usecases.garbage_collection import Bin, Family
 from services.conventions import CHIP_SIZE
@@ -87,6 +90,17 @@ def test_a_kill_while_writing_shows_no_part_of_the_file(storage):
     assert storage.keys("scenes") == []
     assert len(storage.sweep_unfinished(0.0, "upload-")) == 1
     assert files(storage) == []
+
+
+def test_unfinished_files_are_swept_when_they_are_old_and_nobody_writes_them_or_waits_for_more(storage):
+    for name in ("left", "upload-1"):
+        (storage.scratch() / name).write_bytes(b"x")
+    with storage.writing("scenes/a") as writing, storage.scratch_folder("job-"):
+        writing.write(b"x")
+        assert storage.sweep_unfinished(3600.0, "upload-") == []
+        assert storage.sweep_unfinished(0.0, "upload-") == ["left"]
+        assert len(list(storage.scratch().iterdir())) == 3
+    assert files(storage) == ["scenes/a", "unfinished/upload-1"]
 
 
 def test_a_deleted_file_is_gone_with_its_empty_folders(storage):
@@ -178,6 +192,19 @@ def test_what_is_put_back_from_the_trash_replaces_nothing(storage):
     assert storage.keys("trash") == []
 
 
+@pytest.mark.parametrize(
+    ("days", "hours", "deleted"), [(7, 168, 1), (6, 168, 0), (7, 167, 0), (8, 100, 0), (100, 1000, 1)]
+)
+def test_the_trash_is_emptied_after_its_days_by_the_calendar_and_by_the_running_time(
+    storage, days, hours, deleted
+):
+    day = date(2026, 11, 22)
+    discarded(storage, b"old", Moment(day, 310))
+    now = Moment(day + timedelta(days=days), 310 + hours)
+    assert trash.delete_old(storage, now, 7.0) == deleted
+    assert len(storage.keys("trash")) == 1 - deleted
+
+
 @pytest.mark.parametrize(("n_files", "most"), [(120, 100), (2000, 100), (4000, 200)])
 def test_a_sweep_removes_a_twentieth_of_the_files_or_a_hundred_and_of_more_unknown_ones_none(
     storage, n_files, most
@@ -201,6 +228,15 @@ def test_a_chip_file_is_stored_once_under_its_checksum(storage, tmp_path):
     assert files(storage) == [first.key]
 
 
+def test_a_chip_file_that_is_not_the_one_expected_is_named_and_not_stored(storage, tmp_path):
+    np.save(tmp_path / "0000.npy", numbered(3))
+    sha256 = hashlib.sha256((tmp_path / "0000.npy").read_bytes()).hexdigest()
+    refused = storage.put_chips(tmp_path / "0000.npy", expected_sha256="0" * 64)
+    assert (refused.sha256, files(storage)) == (sha256, [])
+    stored = storage.put_chips(tmp_path / "0000.npy", expected_sha256=sha256)
+    assert files(storage) == [stored.key]
+
+
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
 def test_chips_are_read_by_row(storage, stored_chips, tmp_path, dtype):
     np.save(tmp_path / "0000.npy", numbered(9, dtype))
@@ -216,6 +252,70 @@ def test_rows_that_a_chip_file_does_not_have_are_refused(storage, stored_chips, 
     np.save(tmp_path / "0000.npy", numbered(9))
     with pytest.raises(DamagedFile, match="9 chips"):
         stored_chips.read(storage.put_chips(tmp_path / "0000.npy").key, row, count)
+
+
+class WatchedStorage(Storage):
+    """A storage that notes which files are open to be read by position."""
+
+    def reader(self, key: str) -> "WatchedReader":
+        OPEN.append(key)
+        return WatchedReader(super().reader(key), key)
+
+
+@dataclass
+class WatchedReader:
+    """An open file that is noted until it is closed."""
+
+    opened: RangeReader
+    key: str
+
+    def read(self, start: int, length: int) -> bytes:
+        if FAULTS:
+            raise OSError(FAULTS[0], "no data")
+        return self.opened.read(start, length)
+
+    def close(self) -> None:
+        OPEN.remove(self.key)
+        self.opened.close()
+
+
+OPEN: list[str] = []
+FAULTS: list[int] = []
+
+
+@pytest.fixture
+def watched_chips(tmp_path: Path) -> Iterator[StoredChips]:
+    """Chips of the files `a`, `b` and `c` of a watched storage."""
+    storage = WatchedStorage(tmp_path / "storage")
+    for name in "abc":
+        storage.put(f"chips/{name}.npy", [npy(numbered(2))])
+    chips = StoredChips(storage, {}.get)
+    yield chips
+    FAULTS.clear()
+    chips.close()
+    assert OPEN == []
+
+
+def test_the_files_that_were_read_last_stay_open_and_no_more_than_may(watched_chips, monkeypatch):
+    monkeypatch.setattr("app.storage.chips.OPEN_CHIP_FILES", 2)
+    still_open = []
+    for name in "abaca":
+        watched_chips.read(f"chips/{name}.npy", 0, 1)
+        still_open.append("".join(sorted(key[6] for key in OPEN)))
+    assert still_open == ["a", "ab", "ab", "ac", "ac"]
+
+
+@pytest.mark.parametrize(
+    ("number", "error"), [(errno.EIO, DamagedFile), (errno.EMFILE, OSError), (errno.ENOMEM, OSError)]
+)
+def test_a_disk_that_cannot_read_is_damage_and_a_service_without_means_is_not(
+    watched_chips, number, error
+):
+    watched_chips.read("chips/a.npy", 0, 1)
+    FAULTS.append(number)
+    with pytest.raises(error) as raised:
+        watched_chips.read("chips/a.npy", 0, 1)
+    assert isinstance(raised.value, DamagedFile) == (number == errno.EIO)
 
 
 def npy(array: np.ndarray) -> bytes:
