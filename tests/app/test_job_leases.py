@@ -143,6 +143,17 @@ def test_a_job_that_has_ended_is_not_dismissed(database: Database):
         assert jobs.dismiss(connection, waiting.id)
 
 
+def test_one_worker_at_a_time_takes_the_jobs_of_dead_ones_back(database: Database):
+    job = claimed(database, new_job(database).id)
+    let_lease_lapse(database, job.id)
+    with database.transaction() as connection:
+        assert queue.may_sweep(connection)
+        sweep_jobs(database, LEASE_S)
+        assert state_of(database, job.id).state == "running", "another worker does it"
+    sweep_jobs(database, LEASE_S)
+    assert state_of(database, job.id).state == "accepted"
+
+
 def test_a_job_that_fails_keeps_what_it_made_all_the_same(database: Database):
     job = claimed(database, new_job(database).id)
     made = {"verdict": "failed", "files": {"report.json": f"results/{job.id}/1/report.json"}}

@@ -3,17 +3,24 @@
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from uuid import UUID, uuid4
 
 import pytest
 from fastapi.testclient import TestClient
 
+from app.config import Settings
+from app.db import engine, scenes
 from app.db.engine import Database
+from app.db.jobs import attempts, jobs
 from app.db.uploads import LIFE_HOURS
-from app.storage import Storage
+from app.storage import Marker, Storage, read_marker, write_marker
+from app.usecases import storage_identity
 from app.usecases.garbage_collection import FILES_AT_ONCE, Bin, Family
-from app.worker.sweep import MOST_BETWEEN_S, sweep_files
+from app.worker.sweep import MOST_BETWEEN_S, sweep_files, sweep_records
 from tests.app.point_history import jump
 from tests.statements import run_sql
 
@@ -164,3 +171,91 @@ def test_files_being_written_are_not_swept_and_those_of_killed_writers_are(
     clocks_jump(database, storage, A_YEAR_H)
     sweep_files(database, storage, JOB_S)
     assert list(storage.scratch().iterdir()) == []
+
+
+def test_files_under_keys_that_nobody_here_makes_do_not_concern_the_sweep(
+    database: Database, storage: Storage
+):
+    scene = uuid4()
+    for key in (f"scenes/{scene}", f"results/{scene}x/1/a", "uploads/README", f"scenes/{scene}-2/a"):
+        storage.put(key, [b"of an operator"])
+    before = [storage.keys(name) for name in ("scenes", "results", "uploads")]
+    sweep_files(database, storage, JOB_S)
+    assert [storage.keys(name) for name in ("scenes", "results", "uploads")] == before
+    storage.put(f"results/{scene}/1/a", [b"of a job that nobody knows"])
+    sweep_files(database, storage, JOB_S)
+    assert storage.keys("results") == [f"results/{scene}x/1/a"]
+
+
+def test_unfinished_files_stay_as_long_as_an_upload_and_a_job_may_take(
+    database: Database, storage: Storage
+):
+    for hours in (24.5, 25.5):
+        path = storage.scratch() / f"{hours}h"
+        path.write_bytes(b"x")
+        os.utime(path, (time.time() - 3600 * hours,) * 2)
+    sweep_files(database, storage, JOB_S)
+    assert [path.name for path in storage.scratch().iterdir()] == ["24.5h"]
+
+
+def marked(storage: Storage, installation: UUID, generation: int) -> None:
+    write_marker(storage, Marker(installation, generation))
+
+
+def test_a_storage_belongs_to_its_database_up_to_the_generation_of_that(
+    database: Database, storage: Storage
+):
+    row = storage_identity.adopt(database.transaction, storage)
+
+    def refused() -> bool:
+        with database.reading() as connection:
+            return storage_identity.mismatch(connection, storage) is not None
+
+    found = []
+    for installation, ahead in ((row.id, -1), (row.id, 0), (row.id, 1), (uuid4(), 0)):
+        marked(storage, installation, row.storage_generation + ahead)
+        found.append(refused())
+    assert found == [False, False, True, True]
+
+
+def test_an_adopted_storage_has_a_generation_that_its_former_database_never_had(
+    database: Database, storage: Storage
+):
+    marked(storage, uuid4(), 1000)
+    adopted = storage_identity.adopt(database.transaction, storage)
+    assert adopted.storage_generation > 1000
+    assert read_marker(storage) == Marker(adopted.id, adopted.storage_generation)
+
+
+def test_an_empty_storage_is_not_that_of_a_database_with_an_image(
+    dsn: str, settings: Settings, tmp_path: Path
+):
+    with engine.pooled(dsn, settings) as database:
+        with database.transaction() as connection:
+            scene = scenes.begin_upload(connection, None, "a.tif", "a.tif", sigma_m=None)
+            scenes.finish_upload(connection, scene, f"scenes/{scene}/a.tif", 1, "0" * 64)
+        reason = storage_identity.prepare(database.transaction, Storage(tmp_path / "not mounted"))
+    assert reason is not None
+    assert "the storage is empty" in reason
+
+
+def test_no_results_are_removed_from_a_storage_of_another_installation(
+    database: Database, storage: Storage, settings: Settings
+):
+    with database.transaction() as connection:
+        job = jobs.create(connection, "register-scene", {})
+        assert job is not None
+        attempts.claim_next(connection, "w", 30.0)
+        key = storage.put(f"results/{job.id}/1/a", [b"x"]).key
+        attempts.reserve_results(connection, job.id, 1, 1)
+        attempts.succeed(connection, job.id, 1, {"files": {"a": key}})
+        run_sql(connection, "update job set finished_at = finished_at - interval '1 year'")
+        run_sql(connection, "update uptime set elapsed_s = elapsed_s + 86400 * 365")
+    own = read_marker(storage)
+    marked(storage, uuid4(), 1)
+    sweep_records(database, storage, settings)
+    assert storage.keys("results") == [key]
+    assert own is not None
+    marked(storage, own.installation, own.generation)
+    sweep_records(database, storage, settings)
+    assert storage.keys("results") == []
