@@ -7,13 +7,15 @@ from itertools import permutations
 
 import numpy as np
 import pytest
+from sqlalchemy import select
 
 from app.db import engine, points, superseding
-from app.db.density import DENSITY, points_in_box
+from app.db.density import AREA_KM2, DENSITY, points_in_box
 from app.db.engine import driver
 from app.db.features import pages
 from app.db.features.bbox import Box
 from app.db.points import POINTS
+from app.db.schema import density_cell
 from app.db.superseding import SAME_PLACE_M, SHORTEST_DEGREE_M
 from app.errors import Conflict, InputError
 from app.usecases import history
@@ -33,11 +35,21 @@ metre_of_latitude_deg = 1.0 / 111_000.0
 
 
 def made(
-    folder, name: str, lon_lat: Array, frame_sigma_m: float | None = None, version: str = "1", box=BOX
+    folder,
+    name: str,
+    lon_lat: Array,
+    frame_sigma_m: float | None = None,
+    version: str = "1",
+    box=BOX,
+    sigma_factor: float = 1.0,
 ):
     """A block with points at these positions."""
     contents = control_points(len(lon_lat), np.random.default_rng(5), box)
-    contents = replace(contents, lon_lat_h=np.column_stack([lon_lat, contents.lon_lat_h[:, 2]]))
+    contents = replace(
+        contents,
+        lon_lat_h=np.column_stack([lon_lat, contents.lon_lat_h[:, 2]]),
+        covariance_m2=contents.covariance_m2 * sigma_factor**2,
+    )
     block_metadata = metadata(name, version, box)
     if frame_sigma_m is not None:
         frame = AccuracyFigure("absolute", "frame_sigma_m", frame_sigma_m, 30, "survey")
@@ -122,6 +134,87 @@ def test_a_priority_comes_before_every_figure_and_may_change_while_published(con
     assert served(connection) == {"good@1": 30}
     with pytest.raises(InputError, match="priority: 1001 found"):
         lifecycle.prioritise_block(connection, "good", 1001)
+
+
+def test_of_equal_frames_the_more_precise_block_is_served_and_of_equal_blocks_the_newer_one(
+    connection, ingest, places
+):
+    for name, sigma_factor in (("fine", 0.5), ("coarse", 1.0), ("coarse too", 1.0)):
+        ingest(name.replace(" ", "-"), places, sigma_factor=sigma_factor)
+    for name in ("coarse", "coarse-too"):
+        lifecycle.publish_block(connection, name)
+    assert served(connection) == {"coarse-too@1": 30}
+    lifecycle.publish_block(connection, "fine")
+    assert served(connection) == {"fine@1": 30}
+
+
+def test_a_suspended_point_is_not_counted_as_served_until_it_is_reinstated(connection, ingest, places):
+    number = ingest("a", places)
+    lifecycle.publish_block(connection, "a")
+    box = Box(5.2, 43.2, 5.3, 43.3)
+    (first, *_) = points.points_of_block(connection, number).points.id.tolist()
+
+    def counted() -> tuple[int, int]:
+        block = lifecycle.find_block(connection, "a")
+        return block.n_points - block.n_unserved, points_in_box(connection, box)
+
+    assert counted() == (30, 30)
+    history.suspend_point(connection, first, "under water")
+    assert counted() == (29, 29)
+    history.reinstate_point(connection, first)
+    assert counted() == (30, 30)
+
+
+def test_a_block_is_published_and_withdrawn_once(connection, ingest, places):
+    ingest("a", places)
+    with pytest.raises(Conflict, match="is staged"):
+        lifecycle.withdraw_block(connection, "a")
+    lifecycle.publish_block(connection, "a")
+    with pytest.raises(Conflict, match="is published"):
+        lifecycle.publish_block(connection, "a")
+    lifecycle.withdraw_block(connection, "a")
+    with pytest.raises(Conflict, match="is withdrawn"):
+        lifecycle.withdraw_block(connection, "a")
+
+
+@pytest.mark.parametrize("priority", [-1000, 1000])
+def test_a_priority_has_at_most_a_thousand_steps_to_either_side(connection, ingest, places, priority):
+    ingest("a", places[:1], priority=priority)
+    assert lifecycle.prioritise_block(connection, "a", priority).priority == priority
+    with pytest.raises(InputError, match="-1000 to 1000"):
+        lifecycle.prioritise_block(connection, "a", priority + np.sign(priority))
+
+
+@pytest.mark.parametrize("lat", [-80.0, 0.01, 44.0, 60.5, 72.0])
+def test_one_place_is_as_long_from_west_to_east_at_every_latitude(connection, ingest, lat):
+    """Cosines of degrees that are taken for radians are near one at some of them, negative at others."""
+    box = (5.2, lat, 5.3, lat + 0.1)
+    east_deg = 1.0 / metres_per_degree(lat, 0.0)[0]
+    place = np.array([[5.25, lat + 0.05]])
+    for name, east_m in (("a", 0.0), ("near", 9.5), ("far", -10.5)):
+        ingest(name, place + [east_m * east_deg, 0.0], box=box)
+    for name in ("a", "near", "far"):
+        lifecycle.publish_block(connection, name)
+    assert served(connection) == {"far@1": 1, "near@1": 1}
+
+
+def test_the_area_of_a_cell_is_that_inside_the_outlines_and_the_whole_one_at_most(connection, ingest):
+    west, south, side = 5.2, 43.2, 0.1
+    quarter = (west, south, west + side / 2, south + side / 2)
+    cell = (west, south, west + side, south + side)
+
+    def published(name: str, box: tuple[float, float, float, float]) -> float:
+        centre = np.array([[(box[0] + box[2]) / 2, (box[1] + box[3]) / 2]])
+        ingest(name, centre, box=box)
+        lifecycle.publish_block(connection, name)
+        (area,) = connection.execute(select(AREA_KM2).where(density_cell.c.level == 0)).scalars()
+        return float(area)
+
+    metres = metres_per_degree(south + side / 2, 0.0)
+    whole_km2 = float(np.prod(metres) * side**2 / 1e6)
+    assert published("quarter", quarter) == pytest.approx(whole_km2 / 4, rel=0.01)
+    assert published("cell", cell) == pytest.approx(whole_km2, rel=0.01)
+    assert published("cell-again", cell) == pytest.approx(whole_km2, rel=0.01)
 
 
 def test_a_withdrawal_gives_the_place_to_the_next_best(connection, ingest, places):
