@@ -70,6 +70,20 @@ def test_a_block_that_is_exported_ingests_again_as_the_same_points_with_the_same
     assert report.quality.points == 40
 
 
+@pytest.mark.parametrize("limit", [1, 7, 10, 39, 40, 41])
+def test_some_points_of_an_outline_are_spread_evenly_over_all_of_them(
+    connection, storage, tmp_path, limit
+):
+    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block").folder)
+    lifecycle.publish_block(connection, "calanques")
+    everything = point_store.control_points(connection, rectangle(*BOX)).points.id
+    some = point_store.control_points(connection, rectangle(*BOX), limit).points.id
+    assert len(some) == min(limit, len(everything))
+    places = np.searchsorted(everything, some)
+    steps = np.diff([*places, len(everything)])
+    assert set(steps) <= {len(everything) // limit, -(-len(everything) // limit), 1}
+
+
 def test_a_footprint_over_two_blocks_holds_what_is_served_of_both(connection, storage, chips, tmp_path):
     half = (BOX[0], BOX[1], (BOX[0] + BOX[2]) / 2, BOX[3])
     for name, kind, seed in (("a", np.uint8, 1), ("b", np.uint16, 2)):

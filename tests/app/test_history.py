@@ -16,6 +16,7 @@ from app.cli.main import app as amers
 from app.config import Settings
 from app.db import engine, history, registrations
 from app.db.engine import Connection, Database
+from app.db.history import NOT_ATTRIBUTABLE
 from app.db.jobs import attempts, jobs
 from app.db.jobs.attempts import LostJob
 from app.storage import Storage
@@ -259,6 +260,28 @@ def test_a_view_counts_only_where_its_expected_position_is_known(
     }
     for row in rows:
         assert row["successes"] == agreed[row["point_id"], row["view"]]
+
+
+def test_views_of_several_scenes_add_up_without_those_that_a_scene_does_not_show(
+    connection: Connection, stored: Registration
+) -> None:
+    reason = stored.views.reason.copy()
+    active = stored.measures.active[stored.views.point]
+    hidden = np.flatnonzero(active)[: len(NOT_ATTRIBUTABLE)]
+    reason[hidden] = NOT_ATTRIBUTABLE
+    remembered(connection, replace(stored, views=replace(stored.views, reason=reason)), "a")
+    remembered(connection, stored, "b")
+    expected = {
+        (int(stored.measures.point_id[stored.views.point[row]]), int(stored.views.view[row])): (
+            1 if row in hidden else 2,
+            int(stored.views.agreed[row]) * (1 if row in hidden else 2),
+        )
+        for row in np.flatnonzero(active)
+    }
+    rows = run_sql(connection, "select * from view_history").fetchall()
+    assert {
+        (row["point_id"], row["view"]): (row["attempts"], row["successes"]) for row in rows
+    } == expected
 
 
 def test_the_health_of_points_and_views_is_read_with_them(
