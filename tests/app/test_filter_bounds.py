@@ -1,6 +1,7 @@
 """Filters within bounds, read as the library reads them, and parsed where nothing else can be harmed."""
 
 import json
+import math
 import signal
 import subprocess
 import sys
@@ -8,13 +9,15 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+import shapely
 
 from app.db.features import cql2_process
 from app.db.features.cql2 import translate
-from app.db.features.cql2_bounds import parse_json, parse_text
+from app.db.features.cql2_bounds import parse_geometry, parse_json, parse_text
 from app.db.features.cql2_tokens import LONGEST_TEXT, check_text
-from app.db.features.crs import CRS84
+from app.db.features.crs import CRS84, EPSG_3857, EVERY
 from app.db.points import POINTS
 from app.errors import InvalidParameter
 from tests.app.filter_attacks import NAMED
@@ -178,6 +181,37 @@ def test_a_json_filter_that_cannot_be_used_is_refused(text: str, reason: str) ->
 def test_a_document_with_a_value_that_json_does_not_have_is_refused(value: object) -> None:
     with pytest.raises(InvalidParameter, match=r"^filter: "):
         parse_json({"op": "=", "args": [{"property": "saliency"}, value]})
+
+
+def as_mercator(lon_lat: list[tuple[float, float]]) -> dict[str, object]:
+    """A polygon in metres of the map projection, by its own formula (Snyder 1987, equation 7-1)."""
+    ring = [
+        (6378137.0 * math.radians(lon), 6378137.0 * math.asinh(math.tan(math.radians(lat))))
+        for lon, lat in lon_lat
+    ]
+    return {"type": "Polygon", "coordinates": [ring]}
+
+
+def test_a_polygon_means_the_same_in_every_reference_system() -> None:
+    corners = [(5.2, 43.2), (5.3, 43.2), (5.3, 43.4), (5.2, 43.2)]
+    swapped = [(lat, lon) for lon, lat in corners]
+    (lat_first,) = (crs for crs in EVERY.values() if crs.lat_first and not crs.has_height)
+    given = (
+        ({"type": "Polygon", "coordinates": [corners]}, CRS84),
+        ({"type": "Polygon", "coordinates": [swapped]}, lat_first),
+        (as_mercator(corners), EPSG_3857),
+    )
+    for geometry, crs in given:
+        shape = shapely.from_wkb(parse_geometry(geometry, crs, "filter"))
+        assert shapely.get_coordinates(shape) == pytest.approx(np.array(corners), abs=1e-9), crs.uri
+
+
+def test_a_box_across_180_degrees_is_the_small_part_of_the_earth() -> None:
+    shape = shapely.from_wkb(parse_geometry({"bbox": [170.0, -5.0, -160.0, 5.0]}, CRS84, "filter"))
+    inside, outside = ([(175, 0), (-170, 0), (180, 0)], [(0, 0), (165, 0), (-155, 0), (175, 6)])
+    assert shapely.intersects(shape, shapely.points(inside)).all()
+    assert not shapely.intersects(shape, shapely.points(outside)).any()
+    assert shape.area == pytest.approx(30.0 * 10.0)
 
 
 def test_a_large_polygon_in_json_passes() -> None:

@@ -132,6 +132,8 @@ ARITHMETIC = (
     ("saliency - 1 > -0.5", lambda s: s - 1 > -0.5),
     ("saliency * 10 % 2 >= 1", lambda s: s * 10 % 2 >= 1),
     ("saliency * 10 div 2 = 3", lambda s: s * 10 // 2 == 3),
+    ("(saliency - 1) * 10 div 2 = -2", lambda s: np.trunc((s - 1) * 10 / 2) == -2),
+    ("-saliency < -0.5", lambda s: -s < -0.5),
     ("saliency ^ 2 > 0.25", lambda s: s**2 > 0.25),
     ("1 / saliency < 2", lambda s: 1 / s < 2),
     ("0.5 < saliency / 1", lambda s: s > 0.5),
