@@ -252,6 +252,26 @@ def test_jobs_are_listed_page_by_page_and_by_kind_and_state(
     assert client.get("/jobs?status=lost", headers=me).status_code == 400
 
 
+def test_a_page_with_exactly_all_jobs_has_no_next(client: TestClient, me: dict[str, str], scene: str):
+    for _ in range(2):
+        client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=me)
+    for limit, links in ((1, ["self", "next"]), (2, ["self"]), (3, ["self"])):
+        page = client.get(f"/jobs?limit={limit}", headers=me).json()
+        assert [link["rel"] for link in page["links"]] == links
+
+
+def test_the_files_of_a_job_go_when_it_is_removed_and_not_when_it_is_dismissed(
+    client: TestClient, me: dict[str, str], scene: str, database: Database, storage: Storage
+):
+    made = client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=me).json()["jobID"]
+    claimed(database, UUID(made))
+    key = storage.put(f"results/{made}/1/report.json", [b"{}"]).key
+    assert client.delete(f"/jobs/{made}", headers=me).json()["message"] == "dismissed"
+    assert storage.keys("results") == [key], "a worker writes them still"
+    assert client.delete(f"/jobs/{made}", headers=me).json()["message"] == "removed"
+    assert storage.keys("results") == []
+
+
 def test_a_waiting_job_reports_its_queue_position_and_its_scene(
     client: TestClient, me: dict[str, str], scene: str, database: Database
 ):

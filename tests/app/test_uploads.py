@@ -399,6 +399,27 @@ def test_a_complete_upload_is_not_ended_with_its_scene(
     assert storage.keys("scenes") == [f"scenes/{scene}/a.tif"]
 
 
+def test_a_complete_upload_takes_its_end_again_and_nothing_else(client: TestClient, me: dict[str, str]):
+    """The confirmation of the last piece may have been lost."""
+    url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
+    piece(client, url, me, 0, TIFF)
+    assert piece(client, url, me, len(TIFF), b"").status_code == 204
+    assert piece(client, url, me, 0, TIFF).status_code == 404
+    assert piece(client, url, me, len(TIFF) + 1, b"").status_code == 404
+
+
+def test_a_checksum_is_compared_in_small_letters_and_in_capitals(client: TestClient, me: dict[str, str]):
+    for digest in (hashlib.sha256(TIFF).hexdigest(), hashlib.sha256(TIFF).hexdigest().upper()):
+        assert whole(client, me, TIFF, filename="a.tif", sha256=digest).status_code == 204
+
+
+@pytest.mark.parametrize(("sigma_m", "status"), [("0", 422), ("-1", 422), ("inf", 422), ("0.1", 201)])
+def test_the_accuracy_of_a_model_is_a_number_of_metres_above_zero(
+    client: TestClient, me: dict[str, str], sigma_m: str, status: int
+):
+    assert begun(client, me, 10, filename="a.tif", sigma_m=sigma_m).status_code == status
+
+
 def test_a_block_is_ingested_from_a_complete_archive_of_ones_own(
     client: TestClient, bearer: Bearer, connection: Connection
 ):
