@@ -124,6 +124,18 @@ def test_a_proxy_is_named_by_address_or_network() -> None:
         Settings(trusted_proxies="proxy.example.org")
 
 
+@pytest.mark.parametrize(
+    ("kibibytes", "end", "status"), [(50, b"\r\n", b"200"), (50, b"", b"408"), (70, b"", b"431")]
+)
+def test_a_head_that_grows_is_given_up_beyond_64_kib(kibibytes: int, end: bytes, status: bytes) -> None:
+    """Long before the time in which a smaller one has to be complete."""
+    with server(head_seconds=0.5) as port, ExitStack() as lines:
+        line = connect(lines, port)
+        field = b"X-Filler: " + b"x" * 1012 + b"\r\n"
+        line.sendall((HEAD % b"/")[:-2] + field * kibibytes + end)
+        assert line.recv(4096).startswith(b"HTTP/1.1 " + status)
+
+
 def test_many_requests_on_one_connection_do_not_end_it() -> None:
     with server(head_seconds=0.3) as port, ExitStack() as lines:
         line = connect(lines, port)

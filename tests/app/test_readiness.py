@@ -2,6 +2,7 @@
 
 import socket
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 from uuid import uuid4
 
 import psycopg
@@ -113,6 +114,25 @@ def test_a_disk_with_little_room_is_named(settings: Settings):
         reply = client.get("/readyz")
     assert (reply.status_code, reply.json()["status"]) == (200, "degraded")
     assert "AMERS_MIN_FREE_BYTES" in reply.json()["parts"]["disk"]["reason"]
+
+
+class Disk(NamedTuple):
+    """The bytes of a disk, as `shutil.disk_usage` gives them."""
+
+    total: int
+    used: int
+    free: int
+
+
+@pytest.mark.parametrize(("missing", "status"), [(0, "ok"), (1, "degraded")])
+def test_a_disk_has_room_enough_to_the_byte(
+    settings: Settings, database: Database, storage: Storage, monkeypatch, missing: int, status: str
+):
+    free = settings.min_free_bytes - missing
+    monkeypatch.setattr(readiness.shutil, "disk_usage", lambda folder: Disk(10 * free, 9 * free, free))
+    checker = Readiness(Installation(database, storage, settings))
+    assert checker.check()["disk"].status == status
+    checker.close()
 
 
 @pytest.fixture
