@@ -10,7 +10,7 @@ from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
 
 from app import logs
-from app.db import engine, scenes
+from app.db import engine, metrics, scenes
 from app.db.audit import list_changes
 from app.db.jobs import attempts, jobs
 from app.errors import TooLarge, TooMany
@@ -18,7 +18,9 @@ from app.main import create_app
 from app.request_context import Origin, working_for
 from app.usecases import quotas
 from app.usecases.blocks import lifecycle
+from app.usecases.history import suspend_point
 from app.usecases.tokens import create_token
+from app.usecases.usage import read_all_usage
 from tests.app.job_queue import claim
 from tests.factories import make_block
 from tests.statements import run_sql
@@ -204,6 +206,57 @@ def test_the_status_has_the_queue_and_what_is_stored(client, connection, storage
     assert status["points_served"] == 7
     assert status["chip_bytes"] == sum(made.chips(row).nbytes for row in range(7))
     assert status["damaged_files"] == 0
+
+
+def test_points_that_nobody_gets_do_not_count_as_served(connection, storage, tmp_path):
+    for version in ("1", "2"):
+        made = make_block(tmp_path / version, 7, version=version)
+        lifecycle.ingest_block(connection, storage, made.folder)
+    assert metrics.read_gauges(connection).points == 0
+    lifecycle.publish_block(connection, "calanques@1")
+    assert metrics.read_gauges(connection).points == 7
+    suspend_point(connection, 2**26, "under water")
+    assert metrics.read_gauges(connection).points == 6
+    lifecycle.withdraw_block(connection, "calanques@1")
+    assert metrics.read_gauges(connection).points == 0
+
+
+def test_the_oldest_job_that_waits_tells_for_how_long_jobs_wait(connection):
+    assert metrics.read_gauges(connection).oldest_waiting_s == 0.0
+    made = [jobs.create(connection, "register-scene", {}) for _ in range(3)]
+    for job, age_s in zip(made, (100, 1000, 9000), strict=True):
+        assert job is not None
+        run_sql(
+            connection,
+            "update job set created_at = clock_timestamp() - make_interval(secs => %s) where id = %s",
+            [age_s, job.id],
+        )
+    jobs.dismiss(connection, made[2].id)
+    gauges = metrics.read_gauges(connection)
+    assert gauges.queue == 2
+    assert 1000 <= gauges.oldest_waiting_s < 1100
+
+
+def test_pages_of_the_audit_trail_follow_each_other_without_repetition(connection):
+    for number in range(5):
+        create_token(connection, f"token {number}", ["read"])
+    everything = [change.id for change in changes(connection)]
+    pages, before = [], None
+    while page := [change.id for change in list_changes(connection, 2, before, None, None)]:
+        pages += page
+        before = page[-1]
+    assert pages == everything[::-1] == sorted(everything, reverse=True)
+    assert len(pages) == 5
+
+
+def test_who_keeps_most_comes_first_with_the_share_of_his_own_quota(connection, settings):
+    kept = {"little": (10, 20), "much": (1000, 4000), "nothing allowed": (100, 0)}
+    for name, (size_bytes, quota_bytes) in kept.items():
+        token = create_token(connection, name, ["register"], storage_quota_bytes=quota_bytes).token
+        scene = scenes.begin_upload(connection, token.id, "a.tif", "a.tif", sigma_m=None)
+        scenes.finish_upload(connection, scene, f"scenes/{scene}/a.tif", size_bytes, "0" * 64)
+    listed = [(row.name, row.share) for row in read_all_usage(connection, settings)]
+    assert listed == [("much", 0.25), ("nothing allowed", None), ("little", 0.5)]
 
 
 def test_chips_that_two_blocks_share_are_stored_once(client, connection, storage, bearer, tmp_path):
