@@ -119,6 +119,26 @@ def test_the_histories_of_other_blocks_stay(
     assert rows_left(installation.database)["point_history"] == 1
 
 
+def test_the_histories_of_views_go_with_their_block_alone(
+    installation: Installation, withdrawn: MadeBlock, tmp_path: Path
+):
+    ingested(installation, make_block(tmp_path / "newer", seed=2, version="2"), "published")
+    with installation.database.transaction() as connection:
+        for number in (1, 2):
+            run_sql(
+                connection,
+                "insert into view_history (point_id, view, attempts, successes, expected)"
+                " select id, 0, 1, 1, 1 from point where block_number = %s",
+                [number],
+            )
+    delete_block(installation, "calanques@1")
+    with installation.database.reading() as connection:
+        left = run_sql(
+            connection, "select count(*) as n, min(point_id >> 26) as number from view_history"
+        ).fetchone()
+    assert left == {"n": points_of_a_block, "number": 2}
+
+
 def test_a_registration_that_ends_after_the_deletion_leaves_its_measures_and_no_history(
     installation: Installation, withdrawn: MadeBlock
 ):

@@ -1,6 +1,7 @@
 """An exported block ingests again as the same points; an export writes outside of transactions."""
 
 import zipfile
+from dataclasses import replace
 from functools import partial
 from uuid import UUID
 
@@ -20,9 +21,10 @@ from app.usecases.jobs import do_attempt
 from app.usecases.processes import Work
 from services.formats.block.check import check_block
 from services.formats.block.document import rectangle
+from services.formats.block.writer import write_block
 from services.types import point_chips
 from tests.app.job_queue import claim, claimed, new_job
-from tests.factories import BOX, make_block
+from tests.factories import BOX, control_points, make_block, metadata, noise_chips
 from tests.statements import run_sql
 
 COLUMNS = """st_asewkb(geom) as place, sigma_east_m, sigma_north_m, sigma_up_m, corr_east_north,
@@ -139,6 +141,36 @@ def test_an_export_of_too_many_points_is_refused(connection, storage, chips, tmp
     lifecycle.publish_block(connection, "calanques")
     with pytest.raises(InputError, match="more than 4 points"):
         select_points(connection, ExportBlock(BOX), most=4)
+
+
+def test_as_many_points_as_are_allowed_are_exported(connection, storage, tmp_path):
+    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
+    lifecycle.publish_block(connection, "calanques")
+    assert len(select_points(connection, ExportBlock(BOX), most=5).points) == 5
+
+
+def test_an_export_of_several_blocks_claims_what_all_of_them_do_and_nothing_else(
+    connection, storage, tmp_path
+):
+    """West and east of one another, so that both are served."""
+    west, south, east, north = BOX
+    middle = (west + east) / 2
+    stated = {
+        "a": replace(metadata("a", box=(west, south, middle, north)), license="CC-BY-4.0", epoch=2020.0),
+        "b": replace(metadata("b", box=(middle, south, east, north)), license="ODbL-1.0", epoch=2024.5),
+    }
+    for name, one in stated.items():
+        box = (one.extent[:, 0].min(), south, one.extent[:, 0].max(), north)
+        contents = control_points(5, np.random.default_rng(7), box)
+        write_block(tmp_path / name, one, contents, noise_chips(contents), {})
+        lifecycle.ingest_block(connection, storage, tmp_path / name)
+        lifecycle.publish_block(connection, name)
+    whole = select_points(connection, ExportBlock(BOX)).metadata
+    assert (whole.license, whole.epoch) == ("CC-BY-4.0 AND ODbL-1.0", None)
+    assert whole.accuracy == (), "neither states how well its frame is known"
+    western = select_points(connection, ExportBlock((west, south, middle, north))).metadata
+    assert (western.license, western.epoch) == ("CC-BY-4.0", 2020.0)
+    assert western.accuracy == stated["a"].accuracy
 
 
 def test_no_transaction_is_open_while_an_export_writes_files(
