@@ -1,0 +1,160 @@
+"""What a worker makes of the end of an attempt's process, whatever the process has written."""
+
+import signal
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import pytest
+
+from app.config import Settings
+from app.db.engine import Database
+from app.db.jobs import jobs
+from app.db.jobs.jobs import Job
+from app.errors import InputError
+from app.storage import Storage
+from app.worker import attempt
+from app.worker.attempt import NO_ROOM, OUT_OF_MEMORY, Attempts
+from tests.app.job_queue import new_job, state_of
+from tests.statements import run_sql
+
+FILE_TOO_LARGE = -signal.SIGXFSZ
+CRASH = -signal.SIGSEGV
+LEASE_S = 30.0
+
+
+@dataclass
+class Processes:
+    """Processes of attempts that write nothing and end with a code, or never.
+
+    Attributes:
+        code: None: they go on until they are closed.
+        storage: a file of the attempt is left there.
+        closed: whether the last one was ended by the worker.
+    """
+
+    code: int | None
+    storage: Storage
+    closed: bool = False
+
+    def start(
+        self, function: str, arguments: Sequence[str], environment: Mapping[str, str]
+    ) -> "Processes":
+        job_id, number, *_ = arguments
+        self.storage.put(f"results/{job_id}/{number}/report.json", [b"{}"])
+        return self
+
+    def wait(self, timeout_s: float) -> int | None:
+        if self.code is None:
+            time.sleep(timeout_s)
+        return self.code
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@dataclass
+class Worker:
+    """A worker that does attempts at one job."""
+
+    database: Database
+    settings: Settings
+    storage: Storage
+    job: Job
+
+    def attempt_ends(self, code: int | None, *, stops: bool = False) -> Job:
+        """The job after an attempt that is due at once."""
+        with self.database.transaction() as connection:
+            run_sql(connection, "update job set not_before = null")
+        processes = Processes(code, self.storage)
+        Attempts(self.database, processes, self.settings, "w", lambda: stops).do_next_job()  # type: ignore[arg-type]
+        assert processes.closed
+        return state_of(self.database, self.job.id)
+
+
+@pytest.fixture
+def worker(database: Database, settings: Settings, storage: Storage) -> Worker:
+    settings = settings.model_copy(update={"lease_seconds": LEASE_S})
+    return Worker(database, settings, storage, new_job(database))
+
+
+@pytest.mark.parametrize(
+    ("code", "title"), [(OUT_OF_MEMORY, "Memory limit"), (FILE_TOO_LARGE, "File size limit")]
+)
+def test_a_job_that_needs_more_than_it_may_have_fails_at_once(worker: Worker, code: int, title: str):
+    job = worker.attempt_ends(code)
+    assert job.error is not None
+    assert (job.state, job.error["title"]) == ("failed", title)
+    assert worker.storage.keys("results") == []
+
+
+@pytest.mark.parametrize(
+    ("code", "title"), [(CRASH, "Internal error"), (1, "Internal error"), (NO_ROOM, "No room")]
+)
+def test_a_job_whose_process_broke_off_is_tried_three_times(worker: Worker, code: int, title: str):
+    for failures in (1, 2):
+        job = worker.attempt_ends(code)
+        assert (job.state, job.failures, job.error) == ("accepted", failures, None)
+        assert worker.storage.keys("results") == []
+    job = worker.attempt_ends(code)
+    assert job.error is not None
+    assert (job.state, job.error["title"]) == ("failed", title)
+
+
+def test_the_pause_before_the_next_attempt_grows_with_the_failures(worker: Worker):
+    for failures in (1, 2):
+        worker.attempt_ends(CRASH)
+        with worker.database.transaction() as connection:
+            row = run_sql(
+                connection, "select extract(epoch from not_before - updated_at) as pause_s from job"
+            ).fetchone()
+        assert row is not None
+        assert float(row["pause_s"]) == pytest.approx(LEASE_S * failures, abs=1.0)
+
+
+def test_a_job_of_a_worker_that_stops_waits_again_as_if_it_had_not_begun(worker: Worker):
+    job = worker.attempt_ends(None, stops=True)
+    assert (job.state, job.failures, job.error) == ("accepted", 0, None)
+    assert worker.storage.keys("results") == []
+
+
+def test_a_job_is_stopped_after_the_time_that_it_may_take(worker: Worker):
+    worker.settings = worker.settings.model_copy(update={"job_seconds": 2.0})
+    started = time.monotonic()
+    job = worker.attempt_ends(None)
+    assert 2.0 < time.monotonic() - started < 4.0
+    assert job.error is not None
+    assert (job.state, job.error["title"]) == ("failed", "Time limit")
+
+
+def test_a_dismissed_job_is_noticed_long_before_its_lease_is_due(
+    worker: Worker, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(attempt, "LONGEST_BEAT_S", 0.2)
+    worker.settings = worker.settings.model_copy(update={"job_seconds": LEASE_S / 6})
+
+    class Dismissed(Processes):
+        def wait(self, timeout_s: float) -> int | None:
+            with worker.database.transaction() as connection:
+                jobs.dismiss(connection, worker.job.id)
+            return super().wait(timeout_s)
+
+    processes, started = Dismissed(None, worker.storage), time.monotonic()
+    Attempts(worker.database, processes, worker.settings, "w", lambda: False).do_next_job()  # type: ignore[arg-type]
+    assert (processes.closed, time.monotonic() - started < 3.0) == (True, True)
+    assert state_of(worker.database, worker.job.id).state == "dismissed"
+
+
+def test_a_worker_whose_database_was_upgraded_claims_nothing(worker: Worker):
+    with worker.database.transaction() as connection:
+        run_sql(connection, "update alembic_version set version_num = '9999'")
+    with pytest.raises(InputError, match="restart it"):
+        Attempts(
+            worker.database,
+            Processes(0, worker.storage),  # type: ignore[arg-type]
+            worker.settings,
+            "w",
+            lambda: False,
+        ).do_next_job()
+    job = state_of(worker.database, worker.job.id)
+    assert (job.state, job.attempt) == ("accepted", 0)
