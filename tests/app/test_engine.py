@@ -62,6 +62,17 @@ def test_connections_that_died_in_the_pool_are_replaced_unseen(dsn: str, databas
             assert connection.scalar(select(func.count()).select_from(block)) == 0
 
 
+def test_a_request_that_reads_can_do_nothing_else_and_not_for_long(dsn: str, settings: Settings):
+    hasty = settings.model_copy(update={"read_timeout_seconds": 0.1})
+    with engine.pooled(dsn, hasty) as database:
+        with pytest.raises(psycopg.errors.ReadOnlySqlTransaction), database.reading() as connection:
+            connection.execute(text("create temporary table t (n int)"))
+        with pytest.raises(psycopg.errors.QueryCanceled), database.reading() as connection:
+            connection.execute(text("select pg_sleep(3)"))
+        with database.transaction() as connection:
+            connection.execute(text("select pg_sleep(0.3)"))
+
+
 def test_a_snapshot_sees_nothing_that_others_commit_meanwhile(dsn: str, database: Database):
     tokens = select(func.count()).select_from(token)
     with database.snapshot() as snapshot:

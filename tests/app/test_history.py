@@ -19,9 +19,10 @@ from app.db.engine import Connection, Database
 from app.db.history import NOT_ATTRIBUTABLE
 from app.db.jobs import attempts, jobs
 from app.db.jobs.attempts import LostJob
+from app.errors import Conflict, InputError
 from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block, publish_block
-from app.usecases.history import record_measures
+from app.usecases.history import list_histories, record_measures, suspend_point
 from app.usecases.registration.control_sources import points_of_block, points_of_store
 from app.usecases.registration.register import (
     ControlSources,
@@ -400,6 +401,20 @@ def test_a_suspended_point_is_not_given_to_registrations(
     connection.commit()
     ids = points_of_store(database, storage)(outline).points.id
     assert set(ids.tolist()) == set(range(first_id, first_id + 40)) - {first_id + 3}
+
+
+def test_a_suspension_has_a_reason_and_a_list_an_end(connection: Connection, first_id: int):
+    for because in ("", "  ", "x" * 501):
+        with pytest.raises(InputError, match="because"):
+            suspend_point(connection, first_id, because)
+    assert suspend_point(connection, first_id, "x" * 500).suspended_because == "x" * 500
+    with pytest.raises(Conflict, match="already suspended"):
+        suspend_point(connection, first_id, "again")
+    for limit in (1, 1000):
+        assert [point.id for point in list_histories(connection, "suspended", limit)] == [first_id]
+    for limit in (0, 1001):
+        with pytest.raises(InputError, match="limit"):
+            list_histories(connection, "suspended", limit)
 
 
 def test_suspensions_are_decided_on_the_command_line(

@@ -321,6 +321,25 @@ def test_the_collections_say_what_they_hold_and_where(made, get):
     assert get("/collections/roads").status_code == 404
 
 
+@pytest.mark.parametrize(
+    ("accept", "kind"),
+    [
+        ("", "application/geo+json"),
+        ("image/png", "application/geo+json"),
+        ("text/csv", "text/csv"),
+        ("text/csv, application/geo+json", "text/csv"),
+        ("text/csv;q=0.5, application/geo+json;q=0.9", "application/geo+json"),
+        ("application/geo+json;q=0.1, text/csv;q=0.2", "text/csv"),
+        ("text/csv;q=0, */*", "application/geo+json"),
+        ("text/csv;q=many", "application/geo+json"),
+    ],
+)
+def test_points_come_in_the_format_that_the_caller_likes_best(client, bearer, accept, kind):
+    headers = bearer("read") | {"Accept": accept}
+    reply = client.get("/collections/points/items", headers=headers)
+    assert reply.headers["content-type"].partition(";")[0] == kind
+
+
 def test_collections_of_an_empty_store_state_the_whole_world_since_stac_asks_for_an_extent(get):
     extent = get("/collections/points").json()["extent"]
     assert extent["spatial"]["bbox"] == [[-180, -90, 180, 90]]
