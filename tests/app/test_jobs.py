@@ -17,7 +17,7 @@ from app.db.jobs import attempts, jobs
 from app.errors import DamagedFile
 from app.main import create_app
 from app.storage import Storage
-from app.usecases.jobs import error_details
+from app.usecases.jobs import PROCESSES, error_details
 from tests.app.job_queue import LEASE_S, claimed, tickets
 
 Bearer = Callable[[str], dict[str, str]]
@@ -104,6 +104,59 @@ def test_a_scene_of_another_owner_cannot_be_registered(client: TestClient, beare
     reply = client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=bearer("register"))
     assert reply.status_code == 404
     assert scene in reply.json()["detail"]
+
+
+OF_SCENES = [name for name, one in PROCESSES.items() if "scene" in one.input_schema()["properties"]]
+FILE_NAMES = ("model", "mask", "check_points", "dem", "geoid", "vectors")
+
+
+def least_inputs(name: str, scene: str) -> dict[str, Any]:
+    """What a process of one scene must be given."""
+    files = {"vectors": "a.geojson", "dem": "dem.tif"}
+    values = {"scene": scene, **files, "registration": str(uuid4())}
+    return {one: values[one] for one in PROCESSES[name].input_schema()["required"]}
+
+
+def test_no_process_works_on_a_scene_of_another_owner(
+    client: TestClient, me: dict[str, str], bearer: Bearer, scene: str
+):
+    stranger = bearer("register")
+    for name in OF_SCENES:
+        body, execute = {"inputs": least_inputs(name, scene)}, f"/processes/{name}/execution"
+        reply = client.post(execute, json=body, headers=stranger)
+        assert (reply.status_code, f"no scene {scene}" in reply.json()["detail"]) == (404, True), name
+        assert client.post(execute, json=body, headers=me).status_code in (201, 422), name
+
+
+def test_no_process_reads_a_file_that_does_not_lie_beside_its_image(
+    client: TestClient, me: dict[str, str], scene: str
+):
+    inputs = {name: PROCESSES[name].input_schema()["properties"] for name in OF_SCENES}
+    fields = [(name, field) for name in OF_SCENES for field in FILE_NAMES if field in inputs[name]]
+    assert {field for _, field in fields} == set(FILE_NAMES)
+    for name, field in fields:
+        for path in ("../x.geojson", "/etc/x.geojson", "a/b.geojson"):
+            body = {"inputs": {**least_inputs(name, scene), field: path}}
+            reply = client.post(f"/processes/{name}/execution", json=body, headers=me)
+            assert reply.status_code == 422, (name, field)
+            assert f"{field}: {path!r} is not the name of a file" in reply.json()["detail"]
+
+
+def test_scenes_are_registered_together_by_their_owner(
+    client: TestClient, me: dict[str, str], bearer: Bearer, scene: str
+):
+    execute, stranger = "/processes/register-scenes/execution", bearer("register")
+    second = client.post("/scenes?name=b.tif", content=b"II*\0" + bytes(100), headers=stranger)
+    both = {"inputs": {"scenes": [scene, second.json()["id"]]}}
+    for caller in (me, stranger):
+        assert client.post(execute, json=both, headers=caller).status_code == 404
+    assert client.post(execute, json=both, headers=bearer("admin")).status_code == 201
+    twice = {"inputs": {"scenes": [scene, scene]}}
+    assert client.post(execute, json=twice, headers=me).status_code == 422
+    joining = client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=me).json()["jobID"]
+    join = {"inputs": {"scenes": [second.json()["id"]], "join": joining}}
+    reply = client.post(execute, json=join, headers=stranger)
+    assert (reply.status_code, f"no job {joining}" in reply.json()["detail"]) == (404, True)
 
 
 def test_a_removed_scene_cannot_be_registered(client: TestClient, me: dict[str, str], scene: str):
