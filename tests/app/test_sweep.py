@@ -17,9 +17,15 @@ from app.db import engine, scenes
 from app.db.engine import Database
 from app.db.jobs import attempts, jobs
 from app.db.uploads import LIFE_HOURS
-from app.storage import Marker, Storage, read_marker, write_marker
-from app.usecases import storage_identity
-from app.usecases.garbage_collection import FILES_AT_ONCE, Bin, Family
+from app.storage import Marker, Storage, read_marker, trash, write_marker
+from app.usecases import garbage_collection, storage_identity
+from app.usecases.garbage_collection import (
+    FILES_AT_ONCE,
+    Bin,
+    Family,
+    moment,
+    remove_all_unnamed,
+)
 from app.worker.sweep import MOST_BETWEEN_S, sweep_files, sweep_records
 from tests.app.point_history import jump
 from tests.statements import run_sql
@@ -259,3 +265,42 @@ def test_no_results_are_removed_from_a_storage_of_another_installation(
     marked(storage, own.installation, own.generation)
     sweep_records(database, storage, settings)
     assert storage.keys("results") == []
+
+
+def unknown_files(storage: Storage, count: int) -> set[str]:
+    """Files of scenes, results and uploads that no row knows, so many of each."""
+    return {
+        storage.put(f"{name}/{uuid4()}/{file}", [b"x"]).key
+        for name, file in (("scenes", "a.tif"), ("results", "1/a"), ("uploads", "a.zip"))
+        for _ in range(count)
+    }
+
+
+def in_trash(storage: Storage) -> set[str]:
+    return {key for keys in trash.batches(storage).values() for key in keys}
+
+
+def test_what_nobody_knows_goes_into_the_trash_from_every_folder(database: Database, storage: Storage):
+    unknown = unknown_files(storage, 1)
+    sweep_files(database, storage, JOB_S)
+    assert in_trash(storage) == unknown
+    assert storage.keys("scenes") + storage.keys("results") + storage.keys("uploads") == []
+
+
+def test_an_operator_lets_more_files_go_at_once_than_a_sweep(
+    database: Database, storage: Storage, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(garbage_collection, "FILES_AT_ONCE", 2)
+    unknown = unknown_files(storage, 3)
+    sweep_files(database, storage, JOB_S)
+    assert in_trash(storage) == set()
+    assert set(remove_all_unnamed(database, storage)) == unknown
+    assert in_trash(storage) == unknown
+
+
+@pytest.mark.parametrize("hours", [1, 310, 5000])
+def test_the_running_time_of_a_batch_is_in_whole_hours(database: Database, hours: int):
+    with database.transaction() as connection:
+        for elapsed_s, expected in ((3600 * hours - 1, hours - 1), (3600 * hours, hours)):
+            run_sql(connection, "update uptime set elapsed_s = %s", [elapsed_s])
+            assert moment(connection).uptime_h == expected
