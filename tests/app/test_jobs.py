@@ -106,6 +106,14 @@ def test_a_scene_of_another_owner_cannot_be_registered(client: TestClient, beare
     assert scene in reply.json()["detail"]
 
 
+def test_a_scene_whose_image_arrives_still_cannot_be_registered(client: TestClient, me: dict[str, str]):
+    tus = {"Tus-Resumable": "1.0.0", "Upload-Length": "10", "Upload-Metadata": "filename YS50aWY="}
+    arriving = client.post("/uploads", headers=me | tus).headers["amers-scene"]
+    reply = client.post(EXECUTE, json={"inputs": {"scene": arriving}}, headers=me)
+    assert reply.status_code == 409
+    assert "is uploading" in reply.json()["detail"]
+
+
 OF_SCENES = [name for name, one in PROCESSES.items() if "scene" in one.input_schema()["properties"]]
 FILE_NAMES = ("model", "mask", "check_points", "dem", "geoid", "vectors")
 

@@ -148,6 +148,20 @@ def test_of_equal_frames_the_more_precise_block_is_served_and_of_equal_blocks_th
     assert served(connection) == {"fine@1": 30}
 
 
+def test_points_of_a_cell_count_in_proportion_to_the_part_of_it_in_a_box(connection, ingest, places):
+    ingest("a", places)
+    lifecycle.publish_block(connection, "a")
+    boxes = {
+        30: Box(5.2, 43.2, 5.3, 43.3),
+        15: Box(5.1, 43.1, 5.25, 43.4),
+        6: Box(5.22, 43.22, 5.27, 43.26),
+        0: Box(5.3001, 43.2, 5.4, 43.3),
+    }
+    assert {number: points_in_box(connection, box) for number, box in boxes.items()} == {
+        number: number for number in boxes
+    }
+
+
 def test_a_suspended_point_is_not_counted_as_served_until_it_is_reinstated(connection, ingest, places):
     number = ingest("a", places)
     lifecycle.publish_block(connection, "a")
