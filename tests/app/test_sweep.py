@@ -3,12 +3,15 @@
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from uuid import UUID, uuid4
 
+import numpy as np
+import psycopg
 import pytest
 from fastapi.testclient import TestClient
 
@@ -26,7 +29,8 @@ from app.usecases.garbage_collection import (
     moment,
     remove_all_unnamed,
 )
-from app.worker.sweep import MOST_BETWEEN_S, sweep_files, sweep_records
+from app.worker import sweep
+from app.worker.sweep import MOST_BETWEEN_S, Sweeper, sweep_files, sweep_records
 from tests.app.point_history import jump
 from tests.statements import run_sql
 
@@ -304,3 +308,49 @@ def test_the_running_time_of_a_batch_is_in_whole_hours(database: Database, hours
         for elapsed_s, expected in ((3600 * hours - 1, hours - 1), (3600 * hours, hours)):
             run_sql(connection, "update uptime set elapsed_s = %s", [elapsed_s])
             assert moment(connection).uptime_h == expected
+
+
+class SimulatedStop(threading.Event):
+    """The event that ends a sweeper: waits pass at once on its clock, and end after some hours."""
+
+    def __init__(self, hours: float) -> None:
+        super().__init__()
+        self.now_s, self.end_s = 0.0, 3600.0 * hours
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def wait(self, timeout: float | None = None) -> bool:
+        assert timeout is not None
+        self.now_s += timeout
+        return self.now_s > self.end_s
+
+
+def test_jobs_are_swept_thrice_a_lease_and_files_every_hour_after_a_quarter(
+    database: Database, storage: Storage, settings: Settings, monkeypatch: pytest.MonkeyPatch
+):
+    """Neither a bug nor an outage ends the sweeper."""
+    stop = SimulatedStop(hours=3.0)
+    swept: dict[str, list[float]] = {"jobs": [], "records": [], "files": [], "generation": []}
+
+    def noted(what: str) -> Callable[..., None]:
+        def note(*arguments: object) -> None:
+            swept[what].append(stop.now_s)
+            if what == "records" and len(swept[what]) == 1:
+                raise RuntimeError("a bug")
+            if what == "generation" and len(swept[what]) == 2:
+                raise psycopg.OperationalError("an outage")
+
+        return note
+
+    monkeypatch.setattr(sweep, "time", stop)
+    for what in ("jobs", "records", "files"):
+        monkeypatch.setattr(sweep, f"sweep_{what}", noted(what))
+    monkeypatch.setattr(storage_identity, "advance", noted("generation"))
+    patient = settings.model_copy(update={"lease_seconds": 30.0})
+    Sweeper(database, storage, patient, stop).run()
+    assert swept["jobs"] == [10.0 * tick for tick in range(1, 1081)]
+    assert swept["records"] == [910.0, 4510.0, 8110.0]
+    assert swept["files"] == [4510.0, 8110.0], "not after records that could not be swept"
+    assert len(swept["generation"]) == pytest.approx(180, abs=1)
+    assert max(np.diff(swept["generation"])) <= 70.0
