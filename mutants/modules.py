@@ -71,7 +71,9 @@ MODULES = (
         "usecases/jobs.py db/jobs worker/attempt.py",
         "lost_attempts job_leases jobs job_progress fair_queue",
     ),
-    _of_service("superseding", "db/superseding.py db/density.py", "superseding renewal_density"),
+    _of_service(
+        "superseding", "db/superseding.py db/density.py", "superseding renewal_density feature_formats"
+    ),
     _of_service(
         "points",
         "db/points.py db/point_detail.py db/history.py usecases/history.py usecases/features/points.py",
@@ -82,7 +84,7 @@ MODULES = (
     _of_service(
         "cleaning",
         "usecases/garbage_collection.py usecases/retention.py worker/sweep.py",
-        "sweep retention job_leases",
+        "sweep retention job_leases storage_identity",
     ),
     _of_service("config", "config.py", "config"),
 )

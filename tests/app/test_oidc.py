@@ -326,7 +326,7 @@ def test_few_callers_wait_for_keys_that_do_not_arrive_and_the_others_are_refused
     """Each of them occupies a thread of the service."""
     one = Issuer(settings.model_copy(update={"oidc_issuer": issuer.url}))
     issuer.answering.clear()
-    release = threading.Timer(6.0, issuer.answering.set)
+    release = threading.Timer(0.9 * oidc.TIMEOUT_S, issuer.answering.set)
     with ThreadPoolExecutor(oidc.MOST_WAITING) as callers:
         waiting = [callers.submit(one.identify, token_of(issuer)) for _ in range(oidc.MOST_WAITING)]
         while not issuer.asked:
@@ -334,10 +334,9 @@ def test_few_callers_wait_for_keys_that_do_not_arrive_and_the_others_are_refused
         time.sleep(0.5)
         assert not any(caller.done() for caller in waiting)
         release.start()
-        started = time.monotonic()
         with pytest.raises(NotAllowed):
             one.identify(token_of(issuer))
-        assert time.monotonic() - started < 3.0
+        assert not issuer.answering.is_set()
         issuer.answering.set()
         assert {caller.result().name for caller in waiting} == {"Survey office"}
     release.cancel()

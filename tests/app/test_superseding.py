@@ -179,6 +179,16 @@ def test_a_suspended_point_is_not_counted_as_served_until_it_is_reinstated(conne
     assert counted() == (30, 30)
 
 
+def test_nothing_is_counted_where_no_point_is_or_where_none_is_served(connection, ingest, places):
+    number = ingest("a", places[:1])
+    lifecycle.publish_block(connection, "a")
+    (alone,) = points.points_of_block(connection, number).points.id.tolist()
+    here, elsewhere = Box(5.2, 43.2, 5.3, 43.3), Box(100.0, 1.0, 101.0, 2.0)
+    assert [points_in_box(connection, box) for box in (here, elsewhere)] == [1, 0]
+    history.suspend_point(connection, alone, "under water")
+    assert points_in_box(connection, here) == 0
+
+
 def test_a_block_is_published_and_withdrawn_once(connection, ingest, places):
     ingest("a", places)
     with pytest.raises(Conflict, match="is staged"):
