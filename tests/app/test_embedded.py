@@ -8,12 +8,13 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from uuid import uuid4
 
 import psycopg
 import pytest
 
-from app.db.cluster import binaries
+from app.db.cluster import binaries, embedded
 from app.db.cluster.binaries import find_binaries, server_user
 from app.db.cluster.embedded import LONGEST_SOCKET_PATH, Cluster
 from app.errors import InputError
@@ -130,6 +131,27 @@ def test_only_its_user_can_reach_the_socket(own):
         socket_status = own.sockets.stat()
         assert socket_status.st_mode & 0o077 == 0
         assert socket_status.st_uid == server_user(own.folder).uid != 0
+
+
+def test_a_server_that_was_killed_is_not_waited_for(own, monkeypatch):
+    """Where nobody collects dead processes, they take signals still."""
+    waited = []
+
+    def sleep(seconds: float) -> None:
+        waited.append(seconds)
+        time.sleep(seconds)
+
+    monkeypatch.setattr(embedded, "STOP_SECONDS", 5.0)
+    lock = own.data / "postmaster.pid"
+    with own.lease():
+        kill_server(own)
+        dead = subprocess.Popen(["true"], user=server_user(own.folder).uid)
+        os.waitid(os.P_PID, dead.pid, os.WEXITED | os.WNOWAIT)
+        _, *others = lock.read_text().splitlines()
+        lock.write_text("\n".join([str(dead.pid), *others, ""]))
+        monkeypatch.setattr(embedded, "time", SimpleNamespace(monotonic=time.monotonic, sleep=sleep))
+    assert sum(waited) < 1.0
+    dead.wait()
 
 
 def test_the_kill_of_one_user_leaves_the_other_undisturbed(own):

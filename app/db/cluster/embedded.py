@@ -189,10 +189,11 @@ class Cluster:
     def _has_ended(self) -> bool:
         """Whether the server, which was told to stop, removes its lock file: the last thing it does.
 
+        One that was killed leaves the file, and takes signals until somebody collects its process.
         pg_ctl would wait for the same, but looks ten times a second only.
         """
         deadline = time.monotonic() + STOP_SECONDS
-        while (self.data / "postmaster.pid").exists():
+        while (server := _named_in(self.data / "postmaster.pid")) and _works_in(server, self.data):
             if time.monotonic() > deadline:
                 return False
             time.sleep(0.005)
@@ -310,10 +311,9 @@ class Cluster:
     def _forget_dead_server(self) -> None:
         """Remove lock files whose process is another one by now: PostgreSQL would believe in them."""
         for path in (self.data / "postmaster.pid", self.sockets / f"{SOCKET_NAME}.lock"):
-            with suppress(FileNotFoundError, ValueError, IndexError):
-                number = int(path.read_text().splitlines()[0])
-                if not _works_in(number, self.data):
-                    path.unlink()
+            server = _named_in(path)
+            if server and not _works_in(server, self.data):
+                path.unlink(missing_ok=True)
 
     def _start(self, user: ServerUser) -> None:
         version = int((self.data / "PG_VERSION").read_text())
@@ -348,6 +348,14 @@ class Cluster:
 
 def _cluster(settings: Settings) -> Cluster:
     return Cluster(settings.data_folder / "postgres")
+
+
+def _named_in(lock: Path) -> int | None:
+    """The process that a lock file names; None where there is no file, or none that names one."""
+    try:
+        return int(lock.read_text().splitlines()[0])
+    except (FileNotFoundError, ValueError, IndexError):
+        return None
 
 
 def _works_in(number: int, folder: Path) -> bool:
