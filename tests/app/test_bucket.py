@@ -111,6 +111,7 @@ def test_a_file_of_the_scratch_folder_is_stored_and_stays_there(storage: Storage
     storage.link(path, "scenes/c/a.tif")
     assert storage.size("scenes/c/a.tif") == 3
     assert unfinished(storage) == [path]
+    path.unlink()
 
 
 def test_chips_are_read_from_a_bucket_by_ranges(storage: Storage, tmp_path: Path):
