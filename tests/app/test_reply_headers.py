@@ -100,10 +100,13 @@ def test_the_own_names_of_a_service_are_accepted(client: TestClient, host: str):
     [
         ("gcp.example.org", "gcp.example.org", 200),
         ("gcp.example.org", "www.gcp.example.org", 400),
+        ("gcp.example.org", "agcp.example.org", 400),
+        ("gcp.example.org", "gcp.example.org.evil.example", 400),
         ("*.example.org, other.example", "gcp.example.org:443", 200),
         ("*.example.org, other.example", "other.example", 200),
         ("*.example.org", "example.org", 400),
         ("*.example.org", "badexample.org", 400),
+        ("*.example.org", "a.gcp.example.org", 200),
         ("*", "anything.example", 200),
     ],
 )

@@ -41,17 +41,22 @@ def service_runs(database: Database, days: int) -> None:
         run_sql(connection, "update uptime set elapsed_s = elapsed_s + 86400 * %s", [days])
 
 
+def running_job(connection: Connection, storage: Storage) -> tuple[UUID, str]:
+    """A registration job that has written a file of 100 bytes, and the key of the file."""
+    job = jobs.create(connection, "register-scene", {})
+    assert job is not None
+    assert claim(connection, job.id)
+    attempts.reserve_results(connection, job.id, 1, 100)
+    return job.id, storage.put(f"results/{job.id}/1/report.json", [bytes(100)]).key
+
+
 def successful_job(database: Database, storage: Storage) -> UUID:
     """A registration job with a file of 100 bytes."""
     with database.transaction() as connection:
-        job = jobs.create(connection, "register-scene", {})
-        assert job is not None
-        assert claim(connection, job.id)
-        key = storage.put(f"results/{job.id}/1/report.json", [bytes(100)]).key
-        attempts.reserve_results(connection, job.id, 1, 100)
+        job_id, key = running_job(connection, storage)
         registrations.insert_registration(
             connection,
-            job_id=job.id,
+            job_id=job_id,
             scene_id=None,
             block_versions=[],
             options={},
@@ -59,8 +64,8 @@ def successful_job(database: Database, storage: Storage) -> UUID:
             verdict="good",
             files={"report.json": key},
         )
-        attempts.succeed(connection, job.id, 1, {"files": {"report.json": key}})
-    return job.id
+        attempts.succeed(connection, job_id, 1, {"files": {"report.json": key}})
+    return job_id
 
 
 def find(database: Database, job_id: UUID) -> jobs.Job | None:
@@ -98,13 +103,9 @@ def test_results_then_jobs_are_removed_by_default_and_the_registration_stays(
 def failed_job(database: Database, storage: Storage) -> UUID:
     """A registration job that failed and left a file of 100 bytes all the same."""
     with database.transaction() as connection:
-        job = jobs.create(connection, "register-scene", {})
-        assert job is not None
-        assert claim(connection, job.id)
-        key = storage.put(f"results/{job.id}/1/report.json", [bytes(100)]).key
-        attempts.reserve_results(connection, job.id, 1, 100)
-        attempts.fail(connection, job.id, 1, {"title": "no"}, {"files": {"report.json": key}})
-    return job.id
+        job_id, key = running_job(connection, storage)
+        attempts.fail(connection, job_id, 1, {"title": "no"}, {"files": {"report.json": key}})
+    return job_id
 
 
 def test_the_files_of_a_job_that_failed_stay_for_their_days_and_are_removed_after_them(
