@@ -158,6 +158,15 @@ _DESCRIPTIONS = {
         "Largest displacement that grows with the height of the points, as where the lines of sight of "
         "the model are not those of the image; 0 where chance shows one as clearly.",
     ),
+    "correction_against_height": _Description(
+        "Correction up the slope of the ground",
+        "%",
+        2,
+        "The displacement of the points from the model before registration, and their heights, as "
+        "planes over the image: growth of the first up the slope of the second, less two standard "
+        "deviations, as a share of the distance. 0 where it grows as much across the slope, or "
+        "where no other view of the place explains it.",
+    ),
     "structure_within_chips": _Description(
         "Motion within the chips",
         "px",

@@ -40,6 +40,8 @@ _MOVED = (
     "others beside them do not: ground that moved (a landslide, a quarry, ice), or a part of another "
     "image"
 )
+_OF_A_PLANE = 3
+"""Parameters of a plane."""
 _ENOUGH = 4
 """Points that agree elsewhere, from which on one may do so by chance."""
 _MISSED_PERCENT = 10.0
@@ -59,6 +61,14 @@ _CHANCE_OF_SAMPLES = 0.01
 """Of points drawn at random being those of whole samples, at most, to be taken for these."""
 _NODES = 30
 """Places along each side of the image at which the nearest point is sought."""
+_MOST_WITH_SLOPE = 0.6
+"""Percent of a distance by which a correction may grow up the slope of the ground. Attitudes and orbits
+drift by less than a tenth of that; campaigns draw up to a tenth more, at random directions."""
+_ALONG_SLOPE = 1.5
+"""Growth of a correction up the slope over that across it, from which on heights explain it; a rotation
+or a scale has 1."""
+_LARGEST_LEAN = 1.0
+"""Tangent of the largest angle between the lines of sight of two images of one place."""
 
 
 @dataclass(frozen=True)
@@ -225,6 +235,49 @@ def against_height(elsewhere: Elsewhere | None, sight: Array, predicted_px: floa
         f"{elsewhere.false_alarms:.1g}"
     )
     return replace(criterion, note=f"{seen}; {_wrong_sight(elsewhere.slope_px, sight)}")
+
+
+def correction_against_height(
+    displacement_px: Array, line_sample: Array, height_m: Array, gsd_m: float
+) -> Criterion:
+    """The criterion on a correction that grows up the slope of the ground, and hardly across it.
+
+    The relief of a slope moves points in proportion to their heights where the model is that of another
+    view. An affine follows it, so that no residual tells; but beyond the points, and wherever the ground
+    leaves their plane, it is wrong.
+
+    Args:
+        displacement_px: (n, 2) of the active points from where the model was before registration.
+        line_sample: (n, 2) where that was, line and sample.
+        height_m: (n,) their heights.
+        gsd_m: of the scene.
+    """
+    name = "correction_against_height"
+    if len(height_m) <= _OF_A_PLANE:
+        return at_most(name, 0.0, _MOST_WITH_SLOPE, "usable")
+    design = np.column_stack([np.ones(len(height_m)), line_sample - line_sample.mean(axis=0)])
+    inverse = np.linalg.pinv(design)
+    of_height, of_displacement = inverse @ height_m, inverse @ displacement_px
+    steepness = float(np.hypot(*of_height[1:]))
+    if steepness == 0.0:
+        return at_most(name, 0.0, _MOST_WITH_SLOPE, "usable")
+    up = of_height[1:] / steepness
+    growth, beside = up @ of_displacement[1:], np.array([-up[1], up[0]]) @ of_displacement[1:]
+    misfit_px = displacement_px - design @ of_displacement
+    sigma_px = np.sqrt((misfit_px**2).sum() / (len(height_m) - _OF_A_PLANE))
+    percent, across = 100.0 * float(np.hypot(*growth)), 100.0 * float(np.hypot(*beside))
+    by_chance = 200.0 * float(sigma_px * np.linalg.norm(up @ inverse[1:]))
+    lean = percent / 100.0 / steepness * gsd_m
+    explained = percent >= _ALONG_SLOPE * across and lean <= _LARGEST_LEAN
+    least = max(percent - by_chance, 0.0) if explained else 0.0
+    criterion = at_most(name, least, _MOST_WITH_SLOPE, "usable")
+    seen = (
+        f"the correction grows by {percent:.2f} % of the distance up the slope of the ground, and by "
+        f"{across:.2f} % across it, as if seen {np.degrees(np.arctan(lean)):.0f} degrees from the lines "
+        "of sight of the model: the model is that of another view, or the heights of the points have "
+        "another datum or scale"
+    )
+    return replace(criterion, note="" if criterion.met else seen)
 
 
 def elsewhere_criterion(

@@ -16,6 +16,7 @@ from services.quality.frames import why_unknown
 from services.quality.lack_of_fit import (
     against_height,
     breaks_criterion,
+    correction_against_height,
     elsewhere_criterion,
     missed_criterion,
     structure_criteria,
@@ -361,6 +362,12 @@ def _of_fit(scene: AdjustedScene, predicted_px: float) -> list[Criterion]:
     off = ~(np.hypot(*misfit_px.T) <= predicted_px)
     return [
         *structures,
+        correction_against_height(
+            (measures.line_sample - measures.predicted)[measures.active],
+            measures.predicted[measures.active],
+            measures.lon_lat_h[measures.active, 2],
+            scene.gsd_m,
+        ),
         *_behind_breaks(scene),
         missed_criterion(
             "lines",
