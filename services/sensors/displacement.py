@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import njit
 
 from services.types import Array, IntArray
 
@@ -82,11 +83,8 @@ class DisplacementGrid:
 
     def _between(self, values: Array, line_sample: Array) -> Array:
         """Values (k, m, 2) at the nodes, at positions (n, 2)."""
-        (row, down), (column, right) = self._cells(line_sample)
-        first, second, third, fourth = self._corners(values, row, column)
-        above = first + right * (second - first)
-        below = third + right * (fourth - third)
-        return np.asarray(above + down * (below - above))
+        places = np.asarray(line_sample, dtype=np.float64)
+        return np.asarray(_bilinear(self.line, self.sample, values, places))
 
     def _cells(self, line_sample: Array) -> list[tuple[IntArray, Array]]:
         """Along lines and samples: node (n,) before a position, and the share (n, 1) of the way on."""
@@ -107,3 +105,25 @@ class DisplacementGrid:
             values[row + 1, column],
             values[row + 1, column + 1],
         )
+
+
+@njit(cache=True)
+def _bilinear(line: Array, sample: Array, values: Array, line_sample: Array) -> Array:
+    """Values (k, m, 2) at nodes (k,) and (m,), at positions (n, 2); constant beyond the nodes."""
+    out = np.empty((len(line_sample), 2))
+    for n in range(len(line_sample)):
+        i, down = _cell(line, line_sample[n, 0])
+        j, right = _cell(sample, line_sample[n, 1])
+        for k in range(2):
+            above = values[i, j, k] + right * (values[i, j + 1, k] - values[i, j, k])
+            below = values[i + 1, j, k] + right * (values[i + 1, j + 1, k] - values[i + 1, j, k])
+            out[n, k] = above + down * (below - above)
+    return out
+
+
+@njit(cache=True)
+def _cell(nodes: Array, position: float) -> tuple[int, float]:
+    """Node before a position, and the share of the way to the next, 0 to 1."""
+    before = min(max(np.searchsorted(nodes, position, side="right") - 1, 0), len(nodes) - 2)
+    share = (position - nodes[before]) / (nodes[before + 1] - nodes[before])
+    return before, min(max(share, 0.0), 1.0)
