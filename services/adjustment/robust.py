@@ -41,15 +41,11 @@ def likeliest_variance(residual: Array, own: Array, of_points: Array) -> Array:
     Returns:
         (n, 2) px^2; `own + of_points` when the share is 1.
     """
-
-    def log_likelihood(share: float) -> float:
-        std = np.sqrt(own + share**2 * of_points)
-        normalised = np.abs(residual) / std
-        scale = max(float(MAD_TO_STD * np.median(normalised)), 1e-9)
-        tails = np.log1p((normalised / (scale * CAUCHY_TUNING)) ** 2)
-        return float(-np.log(scale * std).sum() - 0.5 * CAUCHY_TUNING**2 * tails.sum())
-
-    gain = np.array([log_likelihood(share) for share in _SHARES])
+    std = np.sqrt(own + _SHARES[:, None, None] ** 2 * of_points)
+    normalised = np.abs(residual) / std
+    scale = np.maximum(MAD_TO_STD * np.median(normalised, axis=(1, 2), keepdims=True), 1e-9)
+    tails = np.log1p((normalised / (scale * CAUCHY_TUNING)) ** 2)
+    gain = -np.log(scale * std).sum(axis=(1, 2)) - 0.5 * CAUCHY_TUNING**2 * tails.sum(axis=(1, 2))
     best = int(np.argmax(gain))
     share = _SHARES[best] if gain[best] > gain[0] + _BEYOND_CHANCE else 1.0
     return np.asarray(own + share**2 * of_points)
