@@ -1,6 +1,7 @@
 """Pixels of an image at any scale, and chips rendered from an image."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import cv2
@@ -279,9 +280,13 @@ def interpolate_nodes(nodes: Array, size: int, node_px: int) -> Array:
         node_px: pixels between nodes.
     """
     weight = _node_weights(nodes.shape[0] // 2, size, node_px)
-    return np.stack([weight @ nodes[..., k] @ weight.T for k in range(2)], axis=-1)
+    positions = np.empty((size, size, 2))
+    for k in range(2):
+        positions[..., k] = weight @ nodes[..., k] @ weight.T
+    return positions
 
 
+@lru_cache(maxsize=16)
 def _node_weights(half: int, size: int, node_px: int) -> Array:
     """Weights (size, 2 half + 1) of the nodes in each pixel along an axis."""
     pixel = (np.arange(size) - size // 2) / node_px
@@ -352,5 +357,6 @@ def sample_image(source: ImageSource | ReducedImage, line_sample: Array, ratio: 
     last += -last % factor
     window = Window(int(first[0]), int(first[1]), *(int(v) for v in last - first))
     pixels = _means(image, window, factor)
-    position = (line_sample - first - (factor - 1) / 2.0) / factor
+    position = line_sample - (first + (factor - 1) / 2.0)
+    position /= factor
     return resample(spline_coefficients(pixels, low_pass_sigma_px(ratio / factor)), position)

@@ -26,9 +26,10 @@ def visible_half_side(patch: FloatImage, half_side: int, radius_px: int) -> int:
         of the chip is centred to `MAX_OFF_CENTRE_PX`. A search wider than that square does not know
         where the chip will lie, and tries the whole of it.
     """
-    row_col = np.argwhere(~np.isfinite(patch))
-    if len(row_col) == 0:
+    seen = np.isfinite(patch)
+    if seen.all():
         return half_side
+    row_col = np.argwhere(~seen)
     centre = patch.shape[0] // 2
     offset = row_col - centre
     distance = np.abs(offset).max(axis=1)

@@ -9,7 +9,14 @@ from services.adjustment.short_motion import ChipStrips
 from services.conventions import CHIP_CENTRE
 from services.geodesy import move_metres
 from services.imagery.gaps import bridged, missing_reason
-from services.imagery.source import ImageSource, ReducedImage, image_gsds_m, low_pass, render_chip
+from services.imagery.source import (
+    ImageSource,
+    ReducedImage,
+    chip_positions,
+    image_gsds_m,
+    low_pass,
+    sample_image,
+)
 from services.matching.chip_extent import central_square, visible_half_side
 from services.matching.chip_strips import chip_strips
 from services.matching.correlate import (
@@ -178,7 +185,7 @@ def match_points(
         if len(view_rows) == 0:
             matches[row] = _not_searched("no_chip")
             continue
-        patch = _predicted_patch(search, points.lon_lat_h[row])
+        patch = _predicted_patch(search, points.lon_lat_h[row], float(gsds_m[row]))
         if not np.isfinite(patch).any():
             matches[row] = _not_searched(missing_reason(patch))
             continue
@@ -222,10 +229,11 @@ def _not_searched(reason: str) -> _PointMatch:
     return _PointMatch(no_measure(0, reason), np.zeros(0, dtype=np.int64), [], False, np.empty((0, 2)))
 
 
-def _predicted_patch(search: ChipSearch, lon_lat_h: Array) -> FloatImage:
+def _predicted_patch(search: ChipSearch, lon_lat_h: Array, scene_gsd_m: float) -> FloatImage:
     """The scene around a point (3,), in the geometry of its chips, as far as it is searched."""
     size = 2 * (CHIP_CENTRE + search.radius_px) + 1
-    return render_chip(search.image, search.model, lon_lat_h, search.gsd_m, size)
+    positions = chip_positions(search.model, lon_lat_h, search.gsd_m, size)
+    return sample_image(search.image, positions, search.gsd_m / scene_gsd_m)
 
 
 def _match_point(

@@ -136,7 +136,7 @@ def find_chip(
     if fit is None:
         return rejected("ambiguous", score)
     covariance = covariance_from_influence(fit.influence)
-    if not math.sqrt(max(np.linalg.eigvalsh(covariance)[1], 0.0)) <= options.max_sigma_px:
+    if not _largest_sigma_px(covariance) <= options.max_sigma_px:
         return rejected("ambiguous", score)
     centre = (np.array(patch.shape) - chip.shape[0]) / 2.0
     sigma_px = sigma_per_coordinate(covariance)
@@ -164,6 +164,12 @@ def _pixel_rejection(
     if _second_peak(scores, row, col, second_distance_px) > thresholds.max_second * score:
         return "ambiguous" if score >= thresholds.min_score else "low_score"
     return ""
+
+
+def _largest_sigma_px(covariance: Array) -> float:
+    """Largest standard deviation in any direction, of a covariance (2, 2)."""
+    mean, difference = np.trace(covariance) / 2.0, (covariance[0, 0] - covariance[1, 1]) / 2.0
+    return math.sqrt(max(mean + math.hypot(difference, covariance[0, 1]), 0.0))
 
 
 def sigma_per_coordinate(covariance: Array) -> float:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+from numba import njit
 
 from services.imagery.gaps import LOST_SHARE
 from services.types import Array, BoolArray, FloatImage
@@ -54,28 +55,37 @@ def patch_statistics(pixels: FloatImage) -> Array:
         (squares, 2): mean, and mean absolute difference of neighbours, of the valid pixels. Where more
         than half of a square is lost, +inf and 0 when most of that is saturated, else NaN.
     """
-    rows, columns = (size // CELL_PX for size in pixels.shape)
-    inner = pixels[: rows * CELL_PX, : columns * CELL_PX]
-    squares = inner.reshape(rows, CELL_PX, columns, CELL_PX).transpose(0, 2, 1, 3)
-    cells = squares.reshape(rows * columns, CELL_PX, CELL_PX).astype(np.float64)
-    valid = np.isfinite(cells)
-    if valid.all():
-        roughness = np.abs(np.diff(cells, axis=2)).mean(axis=(1, 2))
-        return np.column_stack([cells.mean(axis=(1, 2)), roughness])
-    statistics = _of_valid_pixels(np.where(valid, cells, 0.0), valid)
-    lost = valid.mean(axis=(1, 2)) < 1.0 - LOST_SHARE
-    saturated = 2 * np.isposinf(cells).sum(axis=(1, 2)) > (~valid).sum(axis=(1, 2))
-    statistics[lost] = np.where(saturated[lost, None], (np.inf, 0.0), np.nan)
-    return statistics
+    return np.asarray(_statistics(pixels))
 
 
-def _of_valid_pixels(cells: Array, valid: BoolArray) -> Array:
-    """Mean and mean absolute difference of neighbours (n, 2), valid pixels of squares (n, r, c) only."""
-    both = valid[:, :, 1:] & valid[:, :, :-1]
-    steps = np.abs(np.diff(cells, axis=2)) * both
-    sums = np.column_stack([cells.sum(axis=(1, 2)), steps.sum(axis=(1, 2))])
-    counts = np.column_stack([valid.sum(axis=(1, 2)), both.sum(axis=(1, 2))])
-    return np.asarray(np.where(counts > 0, sums / np.maximum(counts, 1), np.nan))
+@njit(cache=True, error_model="numpy")
+def _statistics(pixels: FloatImage) -> Array:
+    rows, columns = pixels.shape[0] // CELL_PX, pixels.shape[1] // CELL_PX
+    out = np.full((rows * columns, 2), np.nan)
+    for square in range(rows * columns):
+        first_row, first_column = square // columns * CELL_PX, square % columns * CELL_PX
+        total, valid, steps, pairs, saturated = 0.0, 0, 0.0, 0, 0
+        for i in range(first_row, first_row + CELL_PX):
+            before = np.nan
+            for j in range(first_column, first_column + CELL_PX):
+                value = np.float64(pixels[i, j])
+                if not np.isfinite(value):
+                    saturated += value == np.inf
+                    before = np.nan
+                    continue
+                total += value
+                valid += 1
+                if np.isfinite(before):
+                    steps += abs(value - before)
+                    pairs += 1
+                before = value
+        lost = CELL_PX * CELL_PX - valid
+        if lost > LOST_SHARE * CELL_PX * CELL_PX:
+            if 2 * saturated > lost:
+                out[square] = np.inf, 0.0
+        else:
+            out[square] = total / valid, steps / pairs
+    return out
 
 
 def cloud_mask(statistics: Sequence[Array], found: BoolArray) -> BoolArray:
