@@ -126,3 +126,33 @@ def test_twice_the_loss_of_health_is_four_times_as_far() -> None:
     assert far[1] == pytest.approx(0.0)
     assert far[3] == pytest.approx(4.0 * far[2])
     assert far[2] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("difference", "expected"),
+    [
+        ({"incidence_deg": SCENE.incidence_deg + 15.0}, 1.0),
+        ({"acquired_at": datetime(2025, 2, 27, tzinfo=UTC)}, 1.0),
+        ({"acquired_at": datetime(2023, 10, 30, tzinfo=UTC)}, 1.0),
+        ({"sun_elevation_deg": 45.0}, 1.0),
+        ({"sun_azimuth_deg": 30.0}, 1.0),
+        ({"sun_azimuth_deg": 310.0}, 1.0),
+        ({"sensor": "SPOT 6"}, 0.25),
+        ({"health": 0.75}, 1.0),
+        ({"health": 0.5}, 4.0),
+        ({"sun_elevation_deg": 60.0, "sensor": "SPOT 6"}, 4.25),
+        ({"sun_elevation_deg": float("nan"), "sun_azimuth_deg": float("nan")}, 2.0),
+        ({"acquired_at": None, "sun_elevation_deg": 45.0}, 2.0),
+    ],
+)
+def test_differences_of_one_documented_unit_weigh_alike_and_add_as_squares(
+    difference: dict[str, object], expected: float
+) -> None:
+    """The units of docs/methods/matching.md; an unknown value counts as one of them."""
+    health = difference.get("health", 1.0)
+    of_image = {name: value for name, value in difference.items() if name != "health"}
+    image = replace(SCENE, **of_image)  # type: ignore[arg-type]
+    views = point_with_views([1.0], [image.incidence_deg], [SCENE.azimuth_deg], image).views
+    views = replace(views, health=np.array([1.0, health]))
+    distance = view_distances(views, SCENE, ViewDistanceScales())[1]
+    assert distance == pytest.approx(expected, abs=1e-2)
