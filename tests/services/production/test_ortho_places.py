@@ -11,6 +11,7 @@ from services.errors import NotEnoughPoints
 from services.imagery.source import ArrayImage
 from services.matching.reference_image import Reference
 from services.production.ortho_control import ControlOrtho, known_on_ortho
+from services.sensors.ortho import OrthoModel
 from services.tasks import Work
 from services.types import Array, Frame, no_progress
 from tests.services.production.displaced_details import (
@@ -46,10 +47,17 @@ def known(
     local_m: float = 1.0,
     noise: float = 0.02,
     times: int = 1,
+    without_px: int = 0,
 ) -> ControlGround:
-    """Details that an image shows in their places, and an ortho-image off by its map and by each."""
+    """Details that an image shows in their places, and an ortho-image off by its map and by each.
+
+    The ortho-image may lack some of its easternmost columns.
+    """
     shown, model = details(), map_moved(details().model, shift_m)
-    reference = replace(reference, image=shown.image(local_m * displaced_m(), noise), model=model)
+    pixels, grid = shown.image(local_m * displaced_m(), noise).pixels, model.grid
+    pixels = pixels[:, : pixels.shape[1] - without_px].copy()
+    cut = OrthoModel(replace(grid, shape=pixels.shape))
+    reference = replace(reference, image=ArrayImage(pixels), model=cut)
     return known_on_ortho(
         [shown.scene("image", np.zeros((SIDE**2, 2)), own.sigma_m)],
         own,
@@ -123,6 +131,16 @@ def test_the_shift_is_searched_as_far_as_both_frames_reach() -> None:
     np.testing.assert_allclose(moved_m.mean(axis=0), 145.0 * north, atol=3.0 * LOCAL_M)
     with pytest.raises(NotEnoughPoints, match=r"a shift of at most 150 m"):
         known(shift_m=220.0 * north, **both)  # type: ignore[arg-type]
+
+
+def test_details_are_searched_where_their_shifted_surroundings_lie_on_the_ortho_image() -> None:
+    """Chips and their search need 116 m to each side.
+
+    Those in the west have 128 m where they lie on the ortho-image, 14 m east of their places, where they
+    would have 114 m. Those in the east have 112 m, and would have 126 m.
+    """
+    column = known(local_m=0.0, without_px=8).point % SIDE
+    assert set(column.tolist()) == set(range(SIDE - 1))
 
 
 def test_details_that_lie_apart_from_each_other_show_no_shift() -> None:
