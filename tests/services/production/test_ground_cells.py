@@ -100,3 +100,29 @@ def test_an_empty_mask_hides_nothing():
     seen, clear = cells_of(shapely.box(0, 0, 1, 1), ground_grid(5_000.0), shapely.MultiPolygon())
     assert seen == clear
     assert len(seen) == pytest.approx(494, abs=25)
+
+
+def test_each_of_many_footprints_has_its_own_cells_and_its_own_mask() -> None:
+    """Together they have more cells than there is room for at first."""
+    grid, rng = ground_grid(4_000.0), np.random.default_rng(1)
+    corner, size = rng.uniform(-60.0, 60.0, (40, 2)), rng.uniform(0.5, 9.0, (40, 2))
+    footprints = [
+        shapely.MultiPolygon(
+            [shapely.box(*low, *(low + side)), shapely.box(*(low + 9.5), *(low + 10.0))]
+        )
+        for low, side in zip(corner, size, strict=True)
+    ]
+    masks = [
+        None if number % 3 == 0 else shapely.box(*low, *(low + side * [0.5, number / 40.0]))
+        for number, (low, side) in enumerate(zip(corner, size, strict=True))
+    ]
+    seen = seen_cells(shapes(*footprints), shapes(*masks), grid)
+    assert len(seen.cell) > 1.5 * 65_536
+    assert seen.start[0] == 0
+    assert seen.start[-1] == len(seen.cell) == len(seen.clear)
+    for number, (footprint, mask) in enumerate(zip(footprints, masks, strict=True)):
+        own = slice(seen.start[number], seen.start[number + 1])
+        every, clear = cells_of(footprint, grid, mask)
+        np.testing.assert_array_equal(seen.cell[own], sorted(every))
+        assert set(seen.cell[own][seen.clear[own]].tolist()) == clear
+        assert (len(clear) < len(every)) == (mask is not None and number > 0)
