@@ -159,3 +159,14 @@ def test_an_image_that_misses_a_quarter_of_a_chip_does_not_show_its_point() -> N
     views = agreed_views(images, details.lon_lat_h, GSD_M)
     np.testing.assert_array_equal(views.reference, np.where(np.arange(9) == 4, 1, 0))
     np.testing.assert_array_equal(views.shown_by, np.where(np.arange(9) == 4, 1, 2))
+
+
+def test_ground_beside_all_images_has_no_reference_and_no_views() -> None:
+    details, still = drawn_details(3), np.zeros((9, 2))
+    images = [details.scene(f"image {k}", still, 5.0) for k in range(2)]
+    far = details.lon_lat_h[:2] + [0.5, 0.0, 0.0]
+    views = agreed_views(images, np.concatenate([far[:1], details.lon_lat_h, far[1:]]), GSD_M)
+    np.testing.assert_array_equal(views.reference, [-1, *[0] * 9, -1])
+    np.testing.assert_array_equal(views.shown_by, [0, *[2] * 9, 0])
+    assert set(views.views.point.tolist()) == set(range(1, 10))
+    assert not views.confirmed(1)[[0, -1]].any()
