@@ -1,0 +1,111 @@
+"""Two kilometres of flat ground without repetition, a scene of its middle, and points with chips."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from services.imagery.scene import Scene
+from services.imagery.source import ArrayImage, CachedImage, Window, render_chip
+from services.map_grid import MapGrid
+from services.matching.multi_image import stored_chip
+from services.registration.context import PointContext, Prediction, RegistrationContext
+from services.registration.options import CoarseOptions, RegistrationOptions
+from services.registration.point_selection import initial_prediction
+from services.sensors.ortho import OrthoModel
+from services.types import (
+    UNKNOWN_FRAME,
+    Acquisition,
+    Array,
+    ControlPoints,
+    FloatImage,
+    Views,
+    no_progress,
+)
+from tests.services.simulated import MemoryChips
+from tests.services.textures import as_pixels, texture
+
+SIDE_PX, GSD_M = 1024, 2.0
+GRID = MapGrid(
+    "EPSG:32633",
+    np.array([499_000.0, 5_601_000.0]),
+    np.array([[0.0, GSD_M], [-GSD_M, 0.0]]),
+    (SIDE_PX, SIDE_PX),
+)
+"""On the central meridian: map north is north."""
+POINT_SIGMA_M = 0.3
+
+
+@cache
+def ground() -> FloatImage:
+    """Grey values of all of it."""
+    return as_pixels(texture(np.random.default_rng(3), SIDE_PX, 2.0))
+
+
+def whole() -> Scene:
+    """An image of all of it, where it lies."""
+    return Scene(ArrayImage(ground()), OrthoModel(GRID), Acquisition("ground"), 1.0)
+
+
+def scene(off_m: Array, sigma_m: float, lines: int = 400, samples: int = 400) -> Scene:
+    """An image of the middle, with noise of its own, whose model is off east and north."""
+    first = (SIDE_PX - lines) // 2, (SIDE_PX - samples) // 2
+    pixels = whole().image.read(Window(*first, lines, samples))
+    pixels = pixels + np.random.default_rng(8).normal(0.0, 30.0, pixels.shape).astype(np.float32)
+    origin = GRID.origin_xy + GRID.step_xy @ np.array(first, dtype=np.float64) + off_m
+    model = OrthoModel(replace(GRID, origin_xy=origin, shape=(lines, samples)))
+    return Scene(ArrayImage(pixels), model, Acquisition("middle"), sigma_m)
+
+
+def points_at(row_col: Array, gsd_m: float = GSD_M) -> tuple[ControlPoints, MemoryChips]:
+    """Points at pixels (n, 2) of the ground, with one chip each."""
+    lon_lat_h = whole().model.locate(row_col, np.zeros(len(row_col)))
+    image = whole()
+    chips = [stored_chip(render_chip(image.image, image.model, place, gsd_m)) for place in lon_lat_h]
+    n = len(lon_lat_h)
+    points = ControlPoints(
+        id=np.arange(n),
+        lon_lat_h=lon_lat_h,
+        covariance_m2=np.tile(POINT_SIGMA_M**2 * np.eye(3), (n, 1, 1)),
+        block=np.zeros(n, dtype=np.int64),
+        frames=(UNKNOWN_FRAME,),
+        saliency=np.ones(n),
+        health=np.ones(n),
+        views=Views(
+            start=np.arange(n + 1),
+            gsd_m=np.full(n, gsd_m),
+            image=np.zeros(n, dtype=np.int64),
+            incidence_deg=np.zeros(n),
+            azimuth_deg=np.zeros(n),
+            health=np.ones(n),
+            images=(Acquisition("ground"),),
+        ),
+        chip_file=np.zeros(n, dtype=np.int64),
+        chip_row=np.arange(n),
+        chip_files=("chips",),
+    )
+    return points, MemoryChips(np.array(chips))
+
+
+@cache
+def many_points() -> tuple[ControlPoints, MemoryChips]:
+    """Points every 110 m, also far beside the scene."""
+    axis = np.arange(55.0, SIDE_PX - 55.0, 55.0)
+    return points_at(np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2))
+
+
+def context_of(of: Scene, **coarse: float) -> RegistrationContext:
+    options = RegistrationOptions(coarse=CoarseOptions(**coarse))  # type: ignore[arg-type]
+    return RegistrationContext(of, options, no_progress, [], None)
+
+
+def point_context(
+    of: Scene, points: ControlPoints, chips: MemoryChips, fine_gsd_m: float, **coarse: float
+) -> PointContext:
+    options = RegistrationOptions(coarse=CoarseOptions(**coarse))  # type: ignore[arg-type]
+    image = CachedImage(of.image)
+    return PointContext(of, options, no_progress, [], None, points, chips, image, fine_gsd_m)
+
+
+def predicted(of: Scene, points: ControlPoints) -> Prediction:
+    return initial_prediction(of, points)

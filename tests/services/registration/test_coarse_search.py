@@ -1,0 +1,55 @@
+"""The first search of few points far out: what it corrects, and when it is refused."""
+
+import numpy as np
+import pytest
+
+from services.errors import NoConsensus
+from services.imagery.scene import Scene
+from services.registration.coarse import search_coarsely
+from services.registration.context import Prediction, SearchStage
+from services.types import Array
+from tests.services.registration.small_ground import (
+    SIDE_PX,
+    point_context,
+    points_at,
+    predicted,
+    scene,
+)
+
+GSD_M = 4.0
+SIGMA_M = 25.0
+OFF_M = np.array([60.0, -42.0])
+MIDDLE = SIDE_PX / 2.0
+
+
+def lattice(count: int, step_px: float) -> Array:
+    """So many rows and columns of points around the middle of the ground."""
+    axis = MIDDLE + (np.arange(count) - (count - 1) / 2.0) * step_px
+    return np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+
+
+def searched(of: Scene, row_col: Array) -> tuple[Prediction, SearchStage]:
+    """The prediction after the search, and its summary."""
+    points, chips = points_at(row_col, GSD_M)
+    context = point_context(of, points, chips, GSD_M, enough=1)
+    prediction = search_coarsely(context, predicted(of, points))
+    (stage,) = context.stages
+    return prediction, stage
+
+
+def test_points_that_agree_correct_the_model() -> None:
+    of = scene(OFF_M, SIGMA_M, 700, 700)
+    prediction, stage = searched(of, lattice(4, 130.0))
+    assert (stage.name, stage.inliers) == ("coarse", 16)
+    assert stage.needed_radius_m < stage.search_radius_m < stage.needed_radius_m + 4.0 * GSD_M
+    points, _ = points_at(lattice(4, 130.0), GSD_M)
+    moved_px = prediction.model.project(points.lon_lat_h) - of.model.project(points.lon_lat_h)
+    np.testing.assert_allclose(moved_px, np.tile([21.0, 30.0], (16, 1)), atol=0.3)
+    assert (prediction.uncertainty_m > GSD_M / 2.0).all()
+    assert (prediction.uncertainty_m < GSD_M).all()
+
+
+def test_points_whose_chips_show_the_same_ground_are_too_few_to_be_believed() -> None:
+    """Chips of 404 m at points 60 m apart: nine agree, and are hardly more than one."""
+    with pytest.raises(NoConsensus, match="9 of them within 12 m of each other, which chance explains"):
+        searched(scene(OFF_M, SIGMA_M, 700, 700), lattice(3, 30.0))
