@@ -9,11 +9,13 @@ from services.errors import NoConsensus
 from services.geodesy import ecef_from_east_north_up, ecef_from_lon_lat_h
 from services.imagery.scene import Scene
 from services.imagery.source import ArrayImage
+from services.map_grid import MapGrid
 from services.matching.consensus import Consensus, Voters
 from services.matching.control_points import PointMatches
 from services.registration.context import SearchStage
 from services.registration.search import check_consensus, first_consensus, predict, summarise
 from services.sensors.base import SensorModel
+from services.sensors.ortho import OrthoModel
 from services.simulation.orbit import pushbroom_over
 from services.types import Acquisition, Array, ViewMeasures
 from tests.factories import control_points
@@ -147,6 +149,76 @@ def test_peaks_at_the_border_ask_for_a_larger_sigma() -> None:
     message = refusal(stage(at_border=40, matched=10))
     assert "40 best peaks lie at the border of the search" in message
     assert "try --sigma-m 200" in message
+
+
+def test_a_refusal_by_a_reference_image_speaks_of_its_places() -> None:
+    message = refusal(stage(name="reference"))
+    assert "the reference does not agree with the scene on one correction: 60 places tried" in message
+    assert "the coarse search does not agree on one correction: 60 points tried" in refusal(stage())
+
+
+def test_a_refusal_names_the_middle_that_was_searched_of_a_scene_too_large_for_it() -> None:
+    message = refusal(stage(middle_m=20_000.0))
+    assert "in the middle 20.0 km of the scene only" in message
+    assert "give points with coarser chips" in message
+
+
+@pytest.mark.parametrize(
+    ("inliers", "false_alarms", "is_accepted"),
+    [(2, 1e-4, True), (1, 1e-4, False), (2, 1.01e-4, False)],
+)
+def test_two_points_beyond_chance_are_accepted(
+    inliers: int, false_alarms: float, is_accepted: bool
+) -> None:
+    if not is_accepted:
+        refusal(stage(inliers=inliers), false_alarms)
+        return
+    consensus = Consensus(np.ones(inliers, dtype=bool), np.zeros(2), false_alarms)
+    check_consensus(stage(inliers=inliers), consensus, np.empty(0), wide_scene(0.0, 5.0), 1e-4)
+
+
+def flat_scene(pixels_per_m: float, side_m: float = 4_000.0) -> Scene:
+    """A square scene north up, of which only the geometry counts."""
+    side = round(side_m * pixels_per_m)
+    step = np.array([[0.0, 1.0], [-1.0, 0.0]]) / pixels_per_m
+    grid = MapGrid("EPSG:32633", np.array([498_000.0, 5.6e6]), step, (side, side))
+    blank = ArrayImage(np.broadcast_to(np.float32(0.0), (side, side)))
+    return Scene(blank, OrthoModel(grid), Acquisition("flat"), 100.0)
+
+
+@pytest.mark.parametrize(("pixels_per_m", "radius_m"), [(0.25, 150.0), (2.0, 250.0)])
+@pytest.mark.parametrize(("room_m", "cut_m"), [(250.0, 0.0), (0.0, 0.0), (0.0, 40.0)])
+@pytest.mark.parametrize("turns", range(4))
+def test_chance_is_that_of_displacements_that_a_search_can_find(
+    pixels_per_m: float, radius_m: float, room_m: float, cut_m: float, turns: int
+) -> None:
+    """Of six points two agree, as drawn: in one of so many draws, whatever the size of the pixels.
+
+    Chips of 100 m at one border of the scene, or farther inside, are found as long as they lie in it.
+    """
+    rng, draws = np.random.default_rng(5), 4000
+    scene, level_m, side_m = flat_scene(pixels_per_m), radius_m / 30.0, 4_000.0
+    across = np.array([[50.0 + cut_m + room_m, 700.0 + 500.0 * k] for k in range(6)])
+    off_m = rng.uniform([-min(room_m, radius_m), -radius_m], radius_m, (draws, 6, 2))
+    pairs = np.hypot(*(off_m[:, :, None] - off_m[:, None, :]).transpose(3, 0, 1, 2)) < 3.0 * level_m
+    happens = (pairs.sum(axis=(1, 2)) > 6).mean()
+    turn = np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), turns)
+    place_m = (across - side_m / 2.0) @ turn.T + side_m / 2.0 - 0.5 / pixels_per_m
+    expected = []
+    for moved_m in off_m[pairs.sum(axis=(1, 2)) == 8][:25]:
+        consensus = first_consensus(
+            scene,
+            place_m * pixels_per_m,
+            (place_m + moved_m @ turn.T) * pixels_per_m,
+            level_m=level_m,
+            radius_m=radius_m,
+            side_m=100.0,
+            cut_px=np.full(2, cut_m * pixels_per_m),
+        )
+        assert consensus.inliers.sum() == 2
+        expected.append(consensus.false_alarms)
+    # Each of six points is expected to find another one: a pair counts twice.
+    assert 0.75 < np.mean(expected) / (2.0 * happens) < 1.4
 
 
 def test_a_limited_search_says_how_far_it_reached() -> None:
