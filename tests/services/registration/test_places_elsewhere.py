@@ -1,0 +1,134 @@
+"""Points of a few lines that agree on another place than the scene are named, from five on."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from services.adjustment.image_correction import AdjustmentOptions
+from services.imagery.scene import Scene
+from services.imagery.source import ArrayImage, CachedImage
+from services.matching.control_points import PointMatches
+from services.quality.lack_of_fit import Elsewhere
+from services.registration.context import PointContext
+from services.registration.elsewhere import adjust_with_places
+from services.registration.options import RegistrationOptions
+from services.registration.search import Search
+from services.types import Acquisition, Array, BoolArray, ViewMeasures, no_progress
+from tests.factories import control_points
+from tests.services.conftest import GSD_M, SHAPE, FlatModel
+from tests.services.simulated import MemoryChips
+
+NOISE_PX = 0.2
+BEYOND_PX = np.array([6.0, 2.0])
+
+
+def named(off_px: Array, place: Array, height_m: Array | None = None) -> Elsewhere | None:
+    """What is named of points (n, 2) that lie off by displacements (n, 2); NaN where not found."""
+    n, rng = len(place), np.random.default_rng(4)
+    heights = rng.normal(80.0, 20.0, n) if height_m is None else height_m
+    points = replace(
+        control_points(n, rng, gsds_m=(GSD_M,)),
+        lon_lat_h=FlatModel().locate(place, heights),
+        covariance_m2=np.tile(1e-4 * np.eye(3), (n, 1, 1)),
+        chip_files=("chips",),
+    )
+    line_sample = place + off_px + rng.normal(0.0, NOISE_PX, (n, 2))
+    found = np.isfinite(off_px).all(axis=1)
+    nothing = np.zeros(0, dtype=np.int64)
+    matches = PointMatches(
+        line_sample=line_sample,
+        displacement_m=(line_sample - place)[:, ::-1] * [GSD_M, -GSD_M],
+        sigma_px=np.where(found, NOISE_PX, np.nan),
+        score=np.ones(n),
+        views=np.ones(n, dtype=np.int64),
+        reason=np.where(found, "", "low_score").astype("<U16"),
+        by_gradient=np.zeros(n, dtype=bool),
+        common_covariance_m2=np.zeros((2, 2)),
+        view_measures=ViewMeasures(nothing, nothing, np.zeros(0), np.zeros(0, bool), np.zeros(0, str)),
+    )
+    blank = ArrayImage(np.broadcast_to(np.float32(0.0), SHAPE))
+    scene = Scene(blank, FlatModel(), Acquisition("flat"), 10.0)
+    options = RegistrationOptions(adjustment=AdjustmentOptions(order="drift", min_points=6))
+    chips = MemoryChips(np.zeros((n * 3, 101, 101), dtype=np.uint16))
+    context = PointContext(
+        scene, options, no_progress, [], None, points, chips, CachedImage(blank), GSD_M
+    )
+    inliers = found & (np.hypot(*(off_px - np.nanmedian(off_px, axis=0)).T) < 3.0)
+    search = Search(points, np.arange(n), matches, inliers, 50.0)
+    return adjust_with_places(context, search)[2]
+
+
+def places(beside: int) -> tuple[Array, BoolArray]:
+    """Sixty points of all lines but 1500 to 2000, and some of these; and which they are."""
+    rng = np.random.default_rng(6)
+    line = np.concatenate([np.linspace(100.0, 1450.0, 24), np.linspace(2050.0, 3900.0, 36)])
+    line = np.concatenate([line, np.linspace(1550.0, 1950.0, beside)])
+    place = np.column_stack([line, rng.uniform(100.0, 4900.0, len(line))])
+    return place, np.arange(len(line)) >= 60
+
+
+@pytest.mark.parametrize("beside", [4, 5, 6])
+def test_five_points_of_lines_beside_the_scene_are_named(beside: int) -> None:
+    place, away = places(beside)
+    elsewhere = named(np.where(away[:, None], BEYOND_PX, 0.0), place)
+    if beside < 5:
+        assert elsewhere is None
+        return
+    assert elsewhere is not None
+    np.testing.assert_array_equal(elsewhere.rows, np.flatnonzero(away))
+    np.testing.assert_allclose(elsewhere.displacement_px, BEYOND_PX, atol=1.5 * NOISE_PX)
+    assert elsewhere.displacement_m == pytest.approx(GSD_M * np.hypot(*BEYOND_PX), abs=NOISE_PX)
+    assert elsewhere.slope_px is None
+
+
+def test_points_that_agree_with_the_scene_or_with_nothing_are_not_named() -> None:
+    place, away = places(8)
+    assert named(np.zeros_like(place), place) is None
+    scattered = np.random.default_rng(9).uniform(-40.0, 40.0, place.shape)
+    assert named(np.where(away[:, None], scattered, 0.0), place) is None
+
+
+SLOPE_PX = np.array([0.08, -0.05])
+"""By how much a metre of height displaces points, line and sample."""
+
+
+def on_slopes(tall: int, relief_m: float) -> tuple[Array, Array, Array]:
+    """Points of ground that rises along the lines, their heights above it, and its heights.
+
+    Some are tall; the others differ by a relief. Three are not found.
+    """
+    place, _ = places(0)
+    ground_m = 50.0 + 0.03 * place[:, 0] + 0.01 * place[:, 1]
+    above_m = np.random.default_rng(11).normal(0.0, relief_m, len(place))
+    above_m[5 :: 55 // tall][:tall] = np.linspace(110.0, 160.0, tall)
+    return place, above_m, ground_m
+
+
+def displaced(above_m: Array, moves: BoolArray) -> Array:
+    """Displacements of points in proportion to their heights, of those that move; three are lost."""
+    off_px = np.where(moves[:, None], above_m[:, None] * SLOPE_PX, 0.0)
+    off_px[[2, 30, 58]] = np.nan
+    return off_px
+
+
+@pytest.mark.parametrize(("tall", "relief_m"), [(8, 0.0), (8, 6.0), (4, 6.0)])
+def test_points_that_are_displaced_as_they_rise_above_the_ground_are_named(
+    tall: int, relief_m: float
+) -> None:
+    place, above_m, ground_m = on_slopes(tall, relief_m)
+    everywhere = np.ones(len(place), dtype=bool)
+    elsewhere = named(displaced(above_m, everywhere), place, ground_m + above_m)
+    assert elsewhere is not None
+    np.testing.assert_array_equal(elsewhere.rows, np.flatnonzero(above_m > 100.0))
+    assert elsewhere.slope_px is not None
+    np.testing.assert_allclose(elsewhere.slope_px, SLOPE_PX, atol=0.01)
+    farthest_px = 160.0 * np.hypot(*SLOPE_PX)
+    assert elsewhere.farthest_px == pytest.approx(farthest_px, abs=4.0 * NOISE_PX)
+    np.testing.assert_allclose(elsewhere.displacement_px, 135.0 * SLOPE_PX, atol=1.0)
+    assert elsewhere.displacement_m == pytest.approx(135.0 * GSD_M * np.hypot(*SLOPE_PX), abs=0.5)
+
+
+def test_few_tall_points_are_not_believed_where_the_others_do_not_move_with_their_heights() -> None:
+    place, above_m, ground_m = on_slopes(4, 6.0)
+    assert named(displaced(above_m, above_m > 100.0), place, ground_m + above_m) is None
