@@ -407,3 +407,76 @@ def test_pixels_of_a_map_are_as_long_as_wide_on_the_ground(crs: str) -> None:
     metres = metres_per_degree_at(np.array([[*corner, 0.0]]))[0]
     for step in (right - corner, down - corner):
         assert np.hypot(*(step * metres)) == pytest.approx(3.0, rel=0.002)
+
+
+@dataclass(frozen=True)
+class BentEvenly(FlatModel):
+    """A plane whose samples move by the square of the height: by `square_px` at 100 m."""
+
+    square_px: float = 0.0
+
+    def project(self, lon_lat_h: Array) -> Array:
+        moved = self.square_px * (lon_lat_h[:, 2] / 100.0) ** 2
+        return super().project(lon_lat_h) + moved[:, None] * [0.0, 1.0]
+
+
+def test_a_model_that_is_quadratic_in_the_height_is_followed_exactly() -> None:
+    """However much it bends: it is interpolated between three heights."""
+    step = np.array([[0.0, 1.0], [-1.0, 0.0]]) * 2.0 * METRE_DEG
+    grid = MapGrid("EPSG:4326", np.zeros(2), step, (90, 70))
+    heights = np.linspace(-100.0, 300.0, 90 * 70, dtype=np.float32).reshape(90, 70)
+    model = BentEvenly(square_px=8.0)
+    mapping = map_into_image(
+        model, Terrain(grid, ArrayImage(heights)), grid, Window(0, 0, 90, 70), the_tolerance_px
+    )
+    assert mapping is not None
+    assert mapping.error_px < 1e-6
+    assert mapping.line_sample.shape == (90, 70, 2)
+    assert mapping.height_m.dtype == np.float32
+    pixels = np.stack(np.indices((90, 70)), axis=-1).reshape(-1, 2).astype(np.float64)
+    exact = model.project(np.column_stack([grid.lon_lat(pixels), heights.ravel()]))
+    assert np.abs(mapping.line_sample.reshape(-1, 2) - exact).max() < 1e-3
+
+
+def test_progress_is_the_share_of_the_lines_that_are_done() -> None:
+    ground, told = terrain(), list[float]()
+    grid = choose_grid(scene(), ground)
+
+    def progress(fraction: float, _: str) -> None:
+        told.append(fraction)
+
+    windows = orthorectify(
+        ramps()[:1], scene().model, ground, grid, OrthoOptions(window_px=100), progress=progress
+    )
+    rows = sorted({one.window.line for one in windows})
+    assert len(rows) > 3
+    np.testing.assert_allclose(told, [*np.array(rows[1:]) / grid.shape[0], 1.0])
+
+
+def plane(side_px: int) -> tuple[FlatModel, Terrain]:
+    """A vertical view of a level plane of so many pixels of half a metre."""
+    step = np.array([[0.0, 1.0], [-1.0, 0.0]]) * side_px * 0.5 * METRE_DEG
+    nodes = MapGrid("EPSG:4326", -step @ np.full(2, 0.25), step, (4, 4))
+    return FlatModel(), Terrain(nodes, ArrayImage(np.zeros((4, 4), dtype=np.float32)))
+
+
+@pytest.mark.parametrize("ratio", [5.0, 20.0])
+def test_a_much_coarser_map_shows_the_image_however_it_is_divided(ratio: float) -> None:
+    """What a window reads beyond its border is all that its pixels consist of."""
+    side = round(50 * ratio)
+    model, ground = plane(side)
+    step = np.array([[0.0, 1.0], [-1.0, 0.0]]) * 0.5 * ratio * METRE_DEG
+    grid = MapGrid("EPSG:4326", step @ np.full(2, 0.5), step, (49, 49))
+    noise = np.random.default_rng(5).normal(500.0, 200.0, (side, side)).astype(np.float32)
+
+    def rendered(window_px: int) -> FloatImage:
+        out = np.full(grid.shape, np.nan, dtype=np.float32)
+        options = OrthoOptions(window_px=window_px)
+        for one in orthorectify([ArrayImage(noise)], model, ground, grid, options):
+            at = one.window
+            out[at.line : at.line + at.lines, at.sample : at.sample + at.samples] = one.pixels[0]
+        return out
+
+    whole = rendered(512)
+    assert np.isfinite(whole).all()
+    np.testing.assert_allclose(rendered(16), whole, atol=1e-3)
