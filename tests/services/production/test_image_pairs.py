@@ -9,7 +9,7 @@ from services.map_grid import MapGrid
 from services.production.image_pairs import PARTNERS, image_pairs
 from services.sensors.ortho import OrthoModel
 from services.simulation.orbit import pushbroom_over
-from services.types import Acquisition, BoolArray, IntArray
+from services.types import Acquisition, Array, BoolArray, IntArray
 
 GSD_M = 10.0
 SIDE = 100
@@ -91,3 +91,28 @@ def test_of_images_of_one_place_those_from_one_side_are_partners() -> None:
     pairs = image_pairs(scenes, [])
     assert (pairs // 10 == pairs[:, :1] // 10).all()
     assert len(pairs) >= 10 * PARTNERS
+
+
+def pairs_one_by_one(places_m: Array, passes: list[BoolArray]) -> set[tuple[int, int]]:
+    """The same choice, image by image: the best of every pass, then the second best, up to eight."""
+    chosen = set()
+    for one, place in enumerate(places_m):
+        apart = np.abs(places_m - place) / (GSD_M * SIDE)
+        share = np.prod(np.maximum(1.0 - apart, 0.0), axis=1)
+        partners = [k for k in np.argsort(-share).tolist() if share[k] >= 0.02 and k != one]
+        of_pass = {k: next((n for n, mask in enumerate(passes) if mask[k]), -1 - k) for k in partners}
+        rounds = [sum(of_pass[j] == of_pass[k] for j in partners[:i]) for i, k in enumerate(partners)]
+        best = sorted(range(len(partners)), key=lambda i: (rounds[i], i))[:PARTNERS]
+        chosen |= {(min(one, partners[i]), max(one, partners[i])) for i in best}
+    return chosen
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_partners_are_the_best_of_every_pass_in_turn(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = 26
+    places_m = rng.uniform(0.0, 1_500.0, (count, 2))
+    of_pass = rng.integers(-1, 4, count)
+    passes = [of_pass == number for number in range(4)]
+    pairs = image_pairs([strip(i, *place) for i, place in enumerate(places_m.tolist())], passes)
+    assert set(map(tuple, pairs.tolist())) == pairs_one_by_one(places_m, passes)
