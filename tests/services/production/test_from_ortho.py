@@ -75,6 +75,15 @@ def test_every_square_of_the_image_gets_a_point() -> None:
     assert (made().points.saliency >= OPTIONS.min_saliency).all()
 
 
+def test_no_square_has_two_points() -> None:
+    """Six rows and columns of squares of 128 pixels."""
+    squares = replace(OPTIONS, spacing_m=128.0 * GSD_M)
+    points = produce_ortho_points([ortho(land())], FLAT, squares).points
+    seen = ortho(land()).model.project(points.lon_lat_h)
+    square = np.floor((seen + 0.5) / 128.0).astype(int)
+    assert len(np.unique(square, axis=0)) == len(points) >= 16
+
+
 def test_points_have_the_height_of_the_ground_and_the_stated_sigmas() -> None:
     points = made().points
     assert (points.lon_lat_h[:, 2] == FLAT.flat_m).all()
