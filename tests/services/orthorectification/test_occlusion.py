@@ -52,7 +52,7 @@ def heights() -> Array:
 
 def truly_hidden(model: Leaning, ground: Terrain, pixels_of: MapGrid, window: Window) -> Array:
     """By how much the ground towards the sensor rises above each line of sight, at most, metres."""
-    at = np.stack(np.indices((window.lines, window.samples)), -1).reshape(-1, 2).astype(float)
+    at = np.moveaxis(np.indices((window.lines, window.samples)), 0, -1).reshape(-1, 2).astype(float)
     lon_lat = pixels_of.lon_lat(at + [window.line, window.sample])
     values = heights()
 

@@ -433,7 +433,7 @@ def test_a_model_that_is_quadratic_in_the_height_is_followed_exactly() -> None:
     assert mapping.error_px < 1e-6
     assert mapping.line_sample.shape == (90, 70, 2)
     assert mapping.height_m.dtype == np.float32
-    pixels = np.stack(np.indices((90, 70)), axis=-1).reshape(-1, 2).astype(np.float64)
+    pixels = np.moveaxis(np.indices((90, 70)), 0, -1).reshape(-1, 2).astype(np.float64)
     exact = model.project(np.column_stack([grid.lon_lat(pixels), heights.ravel()]))
     assert np.abs(mapping.line_sample.reshape(-1, 2) - exact).max() < 1e-3
 
@@ -442,8 +442,9 @@ def test_progress_is_the_share_of_the_lines_that_are_done() -> None:
     ground, told = terrain(), list[float]()
     grid = choose_grid(scene(), ground)
 
-    def progress(fraction: float, _: str) -> None:
+    def progress(fraction: float, message: str) -> None:
         told.append(fraction)
+        assert message
 
     windows = orthorectify(
         ramps()[:1], scene().model, ground, grid, OrthoOptions(window_px=100), progress=progress
