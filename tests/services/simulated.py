@@ -16,6 +16,7 @@ from services.simulation.view import (
     simulate_view,
 )
 from services.simulation.world import World, make_world
+from services.tasks import Work
 from services.types import ChipArray, ControlPoints
 
 SHAPE = (700, 700)
@@ -48,9 +49,17 @@ def block_views() -> tuple[SimulatedView, ...]:
 
 
 @cache
+def production_with_work() -> tuple[Production, Work]:
+    """The points produced from the three views, and what was kept on the way."""
+    work = Work()
+    return produce_points(
+        [view.as_scene(BLOCK_SIGMA_M) for view in block_views()], OPTIONS, work=work
+    ), work
+
+
 def production() -> Production:
     """The points produced from the three views."""
-    return produce_points([view.as_scene(BLOCK_SIGMA_M) for view in block_views()], OPTIONS)
+    return production_with_work()[0]
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,18 @@ from services.imagery.source import ArrayImage, render_chip
 from services.matching.multi_image import stored_chip
 from services.production.from_images import Production, ProductionOptions, produce_points
 from services.simulation.view import plan_geometry
-from services.types import Array, Observations
-from tests.services.simulated import BLOCK_SIGMA_M, OPTIONS, SHAPE, block_views, plan, production, world
+from services.tasks import Work
+from services.types import Array, BoolArray, Observations
+from tests.services.simulated import (
+    BLOCK_SIGMA_M,
+    OPTIONS,
+    SHAPE,
+    block_views,
+    plan,
+    production,
+    production_with_work,
+    world,
+)
 from tests.services.ties import difference_m
 
 pytestmark = pytest.mark.long
@@ -238,6 +248,25 @@ def test_images_without_ground_give_no_points(emptied: Emptied) -> None:
     blank = replace(other, image=ArrayImage(emptied.pixels.astype(np.float32)))
     with pytest.raises(ComputationError):
         produce_points([one, blank], OPTIONS)
+
+
+@pytest.mark.parametrize(
+    ("missing", "said"), [(0, "salient points out of 6"), (1, "tie points whose chip")]
+)
+def test_as_many_tie_points_as_a_block_needs_are_tried_and_no_fewer(missing: int, said: str) -> None:
+    """All ground but that of the points nearest to the middle gets none; no chip is salient enough."""
+
+    def excluded(lon_lat: Array) -> BoolArray:
+        nearest = np.argsort(np.hypot(*((lon_lat - world().centre_lon_lat) * [0.7, 1.0]).T))
+        beside = np.ones(len(lon_lat), dtype=np.bool_)
+        beside[nearest[: OPTIONS.block.min_points - missing]] = False
+        return beside
+
+    kept = production_with_work()[1].kept
+    shown = {name: kept[name] for name in kept if name.startswith(("features/", "matches/"))}
+    options = replace(OPTIONS, min_saliency=2.0)
+    with pytest.raises(NotEnoughPoints, match=said):
+        produce_points(scenes(), options, excluded=excluded, work=Work(kept=shown))
 
 
 def test_progress_grows_from_0_to_1() -> None:
