@@ -130,13 +130,20 @@ def test_the_map_covers_the_ground_of_the_scene_and_little_more() -> None:
     np.testing.assert_allclose((coarse.origin_xy / 7.0 - 0.5) % 1.0 % 1.0, 0.0, atol=1e-6)
 
 
-def test_the_map_of_a_scene_across_180_degrees_is_as_large_as_that_of_another() -> None:
-    model = replace(affine_model(np.array([180.0, -16.0])), image_offset=np.array(SHAPE) / 2.0)
+@pytest.mark.parametrize(("centre_deg", "crs"), [(179.9995, "EPSG:32760"), (-179.9995, "EPSG:32701")])
+@pytest.mark.parametrize("upright", [True, False])
+def test_the_map_of_a_scene_across_180_degrees_is_as_large_as_that_of_another(
+    centre_deg: float, crs: str, upright: bool
+) -> None:
+    """Its first pixel is in the north-west, or in the south-east; its zone is that of its middle."""
+    model = replace(affine_model(np.array([centre_deg, -16.0])), image_offset=np.array(SHAPE) / 2.0)
+    if not upright:
+        model = replace(model, line_num=-model.line_num, sample_num=-model.sample_num)
     across = Scene(ArrayImage(np.zeros(SHAPE, dtype=np.float32)), model, Acquisition("a"), 5.0)
     places = np.array([[179.999, -16.0, 190.0], [-179.999, -16.001, 210.0], [179.9995, -15.999, 200.0]])
     ground = terrain_of_points(places, np.array([[179.99, -16.01], [180.01, -15.99]]))
     grid = choose_grid(across, ground)
-    assert grid.crs in ("EPSG:32701", "EPSG:32760")
+    assert grid.crs == crs
     pixels = np.random.default_rng(1).uniform(-0.5, np.array(SHAPE) - 0.5, (200, 2))
     located = model.locate(pixels, np.full(200, 200.0))
     assert {-1.0, 1.0} == set(np.sign(located[:, 0]))
