@@ -166,6 +166,50 @@ def test_of_several_views_those_that_agree_count() -> None:
     assert (of_points[:, [0, 2]].min(axis=1) > of_points[:, 1]).all()
 
 
+def common_px(off_px: float) -> float:
+    """What all measures share by two images, of which the second shows all points so far off."""
+    points, chips = points_at(GRID)
+    _, displaced = points_at(GRID + [0.0, off_px])
+    n = len(points)
+    stacked = np.stack([chips.chips, displaced.chips], axis=1)
+    views = Views(
+        start=2 * np.arange(n + 1),
+        gsd_m=np.full(2 * n, GSD_M),
+        image=np.tile([0, 1], n),
+        incidence_deg=np.zeros(2 * n),
+        azimuth_deg=np.zeros(2 * n),
+        health=np.ones(2 * n),
+        images=(points.views.images[0], replace(points.views.images[0], image_id="second")),
+    )
+    both = replace(points, views=views, chip_row=2 * np.arange(n))
+    of = scene(OFF_M, 10.0)
+    of = replace(of, acquisition=replace(of.acquisition, incidence_deg=0.0, azimuth_deg=0.0))
+    two = MemoryChips(stacked.reshape(-1, *stacked.shape[2:]))
+    covariance_m2 = matched(of, both, two).common_covariance_m2
+    np.testing.assert_allclose(covariance_m2, covariance_m2[0, 0] * np.eye(2), atol=1e-9)
+    return float(np.sqrt(covariance_m2[0, 0])) / GSD_M
+
+
+def test_all_measures_share_what_their_images_are_off_by() -> None:
+    """A twentieth of a chip pixel at least, and more where two images differ from their mean."""
+    assert 0.05 < common_px(0.0) < 0.15
+    assert 0.6 * 0.3 < common_px(0.6) < 1.6 * 0.3
+
+
+def test_progress_grows_from_nothing_to_less_than_all() -> None:
+    told = list[float]()
+
+    def progress(fraction: float, message: str) -> None:
+        told.append(fraction)
+        assert "searching 100 points with chips of 2 m" in message
+
+    points, chips = points_at(np.repeat(GRID[:1], 100, axis=0))
+    of = scene(OFF_M, 10.0)
+    search = ChipSearch(of.image, of.model, of.acquisition, GSD_M, 4)
+    match_points(search, points, chips, MatchingOptions(), progress)
+    np.testing.assert_allclose(told, [0.0, 0.64])
+
+
 def test_points_that_are_searched_again_replace_those_that_are_found_then() -> None:
     """Half of them lie beyond the first search; of four that are searched again one is not found."""
     points, chips = several_views()
