@@ -6,20 +6,25 @@ import numpy as np
 import pytest
 
 from services.adjustment.image_correction import AdjustmentOptions
+from services.conventions import CHIP_SIZE
 from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, CachedImage
-from services.matching.control_points import PointMatches
+from services.imagery.source import ArrayImage, CachedImage, Window
+from services.matching.control_points import ChipSearch, PointMatches, match_points
 from services.quality.lack_of_fit import Elsewhere
 from services.registration.context import PointContext
 from services.registration.elsewhere import adjust_with_places
 from services.registration.options import RegistrationOptions
-from services.registration.search import Search
+from services.registration.search import Search, select_inliers
 from services.types import Acquisition, Array, BoolArray, ViewMeasures, no_progress
 from tests.factories import control_points
 from tests.services.conftest import GSD_M, SHAPE, FlatModel
+from tests.services.registration.small_ground import GSD_M as GRID_M
+from tests.services.registration.small_ground import point_context, points_at, scene
 from tests.services.simulated import MemoryChips
 
 NOISE_PX = 0.2
+EVENLY = np.sqrt(3.0)
+"""Even errors have this as the largest, standard deviations: none is taken for wrong."""
 BEYOND_PX = np.array([6.0, 2.0])
 
 
@@ -33,7 +38,7 @@ def named(off_px: Array, place: Array, height_m: Array | None = None) -> Elsewhe
         covariance_m2=np.tile(1e-4 * np.eye(3), (n, 1, 1)),
         chip_files=("chips",),
     )
-    line_sample = place + off_px + rng.normal(0.0, NOISE_PX, (n, 2))
+    line_sample = place + off_px + NOISE_PX * rng.uniform(-EVENLY, EVENLY, (n, 2))
     found = np.isfinite(off_px).all(axis=1)
     nothing = np.zeros(0, dtype=np.int64)
     matches = PointMatches(
@@ -132,3 +137,30 @@ def test_points_that_are_displaced_as_they_rise_above_the_ground_are_named(
 def test_few_tall_points_are_not_believed_where_the_others_do_not_move_with_their_heights() -> None:
     place, above_m, ground_m = on_slopes(4, 6.0)
     assert named(displaced(above_m, above_m > 100.0), place, ground_m + above_m) is None
+
+
+def test_lines_that_lie_far_from_the_others_are_found_in_a_wide_window() -> None:
+    """A scene of which the last lines lie 40 pixels aside, where a narrow search does not see them."""
+    axis = 312.0 + np.linspace(60.0, 340.0, 8)
+    points, chips = points_at(np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2))
+    points = replace(points, lon_lat_h=points.lon_lat_h + [[0.0, 0.0, k % 7] for k in range(64)])
+    of = scene(np.zeros(2), 5.0)
+    wide = scene(np.zeros(2), 5.0, 400, 520).image.read(Window(0, 0, 400, 520))
+    pixels = of.image.read(Window(0, 0, 400, 400))
+    pixels[260:] = wide[260:, 100:500]
+    broken = replace(of, image=ArrayImage(pixels))
+    context = point_context(broken, points, chips, GRID_M)
+    narrow = ChipSearch(broken.image, broken.model, broken.acquisition, GRID_M, 6)
+    matches = match_points(narrow, points, chips, context.options.matching)
+    inliers, _ = select_inliers(broken.model, points, matches)
+    search = Search(points, np.arange(64), matches, inliers, CHIP_SIZE * GRID_M)
+    elsewhere = adjust_with_places(context, search)[2]
+    assert elsewhere is not None
+    beside = points.lon_lat_h[elsewhere.rows]
+    line = broken.model.project(beside)[:, 0]
+    assert len(line) >= 8
+    assert line.min() > 260.0
+    np.testing.assert_allclose(elsewhere.displacement_px, [0.0, -40.0], atol=0.5)
+    assert elsewhere.displacement_m == pytest.approx(40.0 * GRID_M, rel=0.02)
+    assert elsewhere.false_alarms < 1e-3
+    assert elsewhere.slope_px is None
