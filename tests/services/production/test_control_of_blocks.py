@@ -132,6 +132,21 @@ def test_a_point_that_one_image_shows_is_not_found() -> None:
         found_in([older("one", [0, 1, 4, 8])], scenes=images()[1:])
 
 
+def test_an_image_of_other_ground_changes_nothing() -> None:
+    """Its number stays with it, before those that show the points or behind them."""
+    far = sees(images()[0], np.array([50_000.0, 0.0]))
+    block = older("one", [0, 4, 7])
+    observations, known = found_in([block], scenes=images()[:2])
+    for at in range(3):
+        scenes = [*images()[:2]]
+        scenes.insert(at, far)
+        beside, known_beside = found_in([block], scenes=tuple(scenes))
+        np.testing.assert_array_equal(beside.line_sample, observations.line_sample)
+        np.testing.assert_array_equal(beside.point, observations.point)
+        np.testing.assert_array_equal(beside.image, observations.image + (observations.image >= at))
+        assert known_beside.names == known.names
+
+
 def test_points_are_searched_as_far_as_both_frames_reach_and_no_farther() -> None:
     """Three standard deviations of 2.2 and of 1.4 m are 4 chip pixels, and 4 more are tried: 16 m."""
     block = older("one", [0, 1, 2, 3, 4, 5])
