@@ -34,10 +34,10 @@ def height_consensus(displacement: Array, height_m: Array, tolerance: float, sea
     length = np.hypot(*displacement.T)
     telling = np.flatnonzero(length > _TELLING * tolerance)
     trials = len(telling)
-    if trials < 2:
+    lean = telling[height_m[telling] != 0.0][:_MOST_TRIED]
+    if trials < 2 or not len(lean):
         return none
-    slopes = displacement[telling] / height_m[telling, None]
-    slopes = slopes[np.isfinite(slopes).all(axis=1)][:_MOST_TRIED]
+    slopes = displacement[lean] / height_m[lean, None]
     moved = slopes[:, None] * height_m[None, :, None]
     agrees = np.linalg.norm(displacement - moved, axis=2) <= tolerance
     count = agrees[:, telling].sum(axis=1)

@@ -102,3 +102,12 @@ def test_random_displacements_are_no_other_view() -> None:
         displacement = rng.uniform(-40.0, 40.0, (n, 2))
         alarms += view_consensus(position, displacement, height_m, 3.0, 40.0)[1] < 1e-3
     assert alarms == 0
+
+
+def test_points_in_one_plane_tell_no_slope_however_far_they_lie() -> None:
+    """Heights on the plane through the others are zero to the last digit, as at sea level."""
+    rng = np.random.default_rng(8)
+    displacement = rng.uniform(-50.0, 50.0, (100, 2))
+    for height_m in (np.zeros(100), np.where(np.arange(100) < 99, 0.0, 20.0)):
+        seen = height_consensus(displacement, height_m, TOLERANCE_PX, REACH_PX)
+        assert not seen.inliers.any() or seen.false_alarms > 1e-3
