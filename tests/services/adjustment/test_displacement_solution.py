@@ -12,11 +12,12 @@ from services.adjustment.displacement_components import (
     Component,
     likeliest_components,
     unit_variance,
+    with_components,
 )
-from services.adjustment.displacement_solution import by_affine, solve_displacement
+from services.adjustment.displacement_solution import agreeing_with, by_affine, solve_displacement
 from services.adjustment.structure import Residuals, structures
 from services.sensors.correction import no_correction
-from services.types import Array
+from services.types import Array, BoolArray
 
 SHAPE = (4000, 3000)
 EXTENT_PX = 3500.0
@@ -66,6 +67,7 @@ def log_likelihood(residuals: Residuals, component: Component, variance_px2: Arr
 SMOOTH = Component("smooth", 2000.0, np.nan, np.array([1.0, 9.0]))
 STEP = Component("step", 20.0, 2100.0, np.array([16.0, 4.0]))
 """Whose gap is narrower than that between points."""
+ACROSS = Component("smooth", 2500.0, np.nan, np.array([25.0, 1.0]), along="samples")
 
 
 @pytest.mark.parametrize(
@@ -82,6 +84,19 @@ def test_no_other_variance_or_length_of_a_component_is_likelier(truth: Component
         for times in (0.4, 2.5):
             other = replace(component, length_px=component.length_px * times)
             assert log_likelihood(residuals, other, component.variance_px2) < most
+
+
+@pytest.mark.parametrize("seed", [1, 3, 7, 11])
+def test_beside_another_component_no_other_variance_or_length_of_one_is_likelier(seed: int) -> None:
+    """The one that is found first looks small beside what nobody follows yet."""
+    residuals = moved(moved(measures(seed), SMOOTH, seed), ACROSS, seed + 100)
+    components, _ = likeliest_components(residuals, EXTENT_PX)
+    assert {one.along for one in components} == {"lines", "samples"}
+    for k, one in enumerate(components):
+        beside = with_components(residuals, components[:k] + components[k + 1 :])
+        most = log_likelihood(beside, one, one.variance_px2)
+        for ratio in ([2.0, 1.0], [0.5, 1.0], [1.0, 2.0], [1.0, 0.5]):
+            assert log_likelihood(beside, one, one.variance_px2 * ratio) <= most
 
 
 def test_lines_and_samples_that_change_places_change_the_variances_of_a_component() -> None:
@@ -174,3 +189,45 @@ def test_the_variance_of_unit_weight_is_one_of_few_points_as_well() -> None:
     assert np.mean([unit_variance(measures(seed, 15)) for seed in range(300)]) == pytest.approx(
         1.0, abs=0.05
     )
+
+
+def some_wrong(seed: int) -> tuple[Residuals, BoolArray]:
+    """Measures of an image that moves smoothly, and which (n,) of them lie off by 12 to 20 sigmas."""
+    residuals = moved(measures(seed), SMOOTH, seed)
+    rng = np.random.default_rng([3, seed])
+    wrong = np.arange(len(residuals.misfit)) < 8
+    off_px = SIGMA_PX * rng.choice([-1.0, 1.0], (8, 2)) * rng.uniform(12.0, 20.0, (8, 2))
+    misfit = residuals.misfit.copy()
+    misfit[wrong] += off_px
+    return replace(residuals, misfit=misfit), wrong
+
+
+@pytest.mark.parametrize("times", [0.1, 1.0, 10.0])
+def test_the_measures_that_disagree_are_the_same_whatever_all_sigmas_state(times: float) -> None:
+    residuals, wrong = some_wrong(5)
+    stated = replace(residuals, covariance=times**2 * residuals.covariance)
+    agrees = agreeing_with(stated, (SMOOTH.scaled(times**2),), np.zeros((2, 3)), 4.0)
+    np.testing.assert_array_equal(agrees, ~wrong)
+
+
+@pytest.mark.parametrize("off_px", [[0.0, 0.0], [900.0, -1300.0], [-900.0, 1300.0]])
+@pytest.mark.parametrize("reach", [0.4, 1.2])
+def test_a_displacement_covers_the_points_and_the_image_wherever_the_model_expects_it(
+    off_px: list[float], reach: float
+) -> None:
+    """Points may lie beyond the borders of the image, or on a part of it."""
+    residuals, last = measures(6), np.array(SHAPE) - 1.0
+    middle = 0.5 * last
+    shown = middle + reach * (residuals.line_sample - middle)
+    expected = replace(residuals, line_sample=shown - off_px, misfit=residuals.misfit + off_px)
+    components = (SMOOTH, replace(SMOOTH, along="samples"))
+    grid = solve_displacement(expected, components, A_PRIORI, SHAPE).displacement
+    for axis, nodes in enumerate((grid.line, grid.sample)):
+        corners = np.array([0.0, last[axis]]) - off_px[axis]
+        places = np.concatenate([corners, expected.line_sample[:, axis]])
+        own_px = np.abs(residuals.misfit[:, axis]).max()
+        # Where the model is right, it expects the image at its own pixels.
+        assert nodes[0] <= places.min() + own_px
+        assert nodes[-1] >= places.max() - own_px
+        assert nodes[0] >= min(places.min(), 0.0) - own_px
+        assert nodes[-1] <= max(places.max(), last[axis]) + own_px
