@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2, f
 
 from services.adjustment.block_problem import BlockOptions
 from services.adjustment.bundle import BlockAdjustment, adjust_block
@@ -304,6 +305,28 @@ def test_the_share_that_observations_tell_of_a_parameter_is_what_they_take_off_i
     np.testing.assert_allclose(block.determined, 1.0 - variance / prior_px**2, atol=0.01)
     slopes = block.determined[:, [1, 2, 4, 5]]
     assert 0.05 < slopes.min() < slopes.max() < 0.95
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_drifts_that_few_images_show_have_the_regions_of_few_squares(count: int) -> None:
+    """The variance that nine of ten draws of Fisher's law need, not the mean of two or three squares."""
+    slope_px, drift_px, stated_count = 0.2, 0.8, 0.3
+    geometries, rng = ring_of_geometries(count), np.random.default_rng(2)
+    images = [
+        image_parameters(g.plan.image_id, g.rpc, g.plan.shape, shift_px=PRIOR_PX, slope_px=slope_px)
+        for g in geometries
+    ]
+    ties = make_ties(geometries, rng, 100, NOISE_PX).observations
+    half = np.array(geometries[0].plan.shape) / 2.0
+    drift = rng.normal(0.0, drift_px, (count, 2, 2))
+    moved_px = np.einsum("mij,mj->mi", drift[ties.image], ties.line_sample / half - 1.0)
+    block = adjust_block(images, replace(ties, line_sample=ties.line_sample + moved_px))
+    slopes = [1, 2, 4, 5]
+    shown = stated_count + float(block.determined[:, slopes].sum())
+    mean_square = (stated_count + float((block.values[:, slopes] ** 2).sum()) / slope_px**2) / shown
+    region = 2.0 * f.ppf(0.9, 2, shown) / chi2.ppf(0.9, 2)
+    assert block.slope_factor**2 == pytest.approx(mean_square * region, rel=0.06)
+    assert region > (3.0 if count == 2 else 1.1)
 
 
 def test_the_observations_that_leave_are_the_wrong_ones(trials: list[Trial]) -> None:

@@ -136,6 +136,19 @@ def test_a_bend_that_points_show_clearly_is_left_its_size() -> None:
     assert variance_px2(3.0, 0.05, 0.7) == pytest.approx(9.0, rel=0.1)
 
 
+@pytest.mark.parametrize(
+    ("reach", "sigma_px", "left_open"),
+    [(0.1, 0.3, True), (0.1, 3.0, False), (0.4, 0.5, True), (0.4, 10.0, False)],
+)
+def test_bends_matter_beside_what_an_affine_correction_leaves_uncertain(
+    reach: float, sigma_px: float, left_open: bool
+) -> None:
+    """A bend of a pixel at the points is nothing where the shift and the skew are uncertain by more."""
+    place = np.random.default_rng(2).random((60, 2)) * [1.0, reach] * (np.array(SHAPE) - 1.0)
+    shown = residuals(place, np.zeros((60, 2)), sigma_px)
+    assert bool(bends(shown, np.zeros((2, 3)), SHAPE)) is left_open
+
+
 def test_bends_of_samples_are_those_of_lines_when_the_axes_are_swapped() -> None:
     rng = np.random.default_rng(5)
     place = rng.random((40, 2)) * [1.0, 0.5] * (np.array(SHAPE) - 1.0)

@@ -87,6 +87,23 @@ def test_a_step_has_three_points_on_each_side(beside: int) -> None:
         assert found.largest_px == pytest.approx(largest_px, rel=0.04)
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("degree", "name"), [(2, "quadratic"), (3, "cubic")])
+def test_a_bow_is_named_by_the_degree_that_explains_all_of_it(axis: int, degree: int, name: str) -> None:
+    """A bend is a polynomial about the middle of the points: odd ones need no even one."""
+    residuals = independent(np.random.default_rng(76))
+    low, high = residuals.line_sample[:, axis].min(), residuals.line_sample[:, axis].max()
+    unit = (residuals.line_sample[:, axis] - 0.5 * (low + high)) / (0.5 * (high - low))
+    bow = np.outer(unit**degree, [30.0, -10.0])
+    bent = replace(residuals, misfit=bow + 1e-3 * residuals.misfit)
+    found = structures(bent, ("lines" if axis == 0 else "samples",))[0]
+    assert found.shape == name
+    beyond = bow - residuals.design @ np.linalg.lstsq(residuals.design, bow, rcond=None)[0]
+    shape_px = bow.std(axis=0) if degree == 2 else (np.outer(unit**3 - 0.6 * unit, [30.0, -10.0])).std(0)
+    np.testing.assert_allclose(found.size_px, shape_px, rtol=1e-3)
+    assert found.largest_px > np.linalg.norm(beyond, axis=1).mean()
+
+
 def test_no_period_is_looked_for_that_is_shorter_than_a_chip() -> None:
     residuals = independent(np.random.default_rng(75))
     phase = 2.0 * np.pi * residuals.line_sample[:, 0] / 150.0
