@@ -1,11 +1,12 @@
 """Parts of an image between breaks are placed by their own points, or stated as unknown."""
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import pytest
 
-from services.adjustment.broken_image import placed_steps
+from services.adjustment.broken_image import held_parts, placed_steps
 from services.adjustment.control_observations import ControlObservations
 from services.adjustment.displacement_components import Component
 from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
@@ -145,6 +146,22 @@ def test_lines_end_half_a_pixel_before_the_first_line_behind_a_break() -> None:
     before = Component("break", 1.0, 2000.0, np.ones(2))
     (placed,) = placed_steps(np.array([2000]), (before,), correction)
     assert placed.at_px + placed.length_px / 2.0 == pytest.approx((1999.5 + 2019.5) / 2.0)
+
+
+@pytest.mark.parametrize("counts", list(product((0, 2, 3), repeat=3)))
+def test_a_part_is_held_by_three_active_points_whatever_holds_the_others(
+    counts: tuple[int, int, int],
+) -> None:
+    """First lines behind breaks belong to the part behind, and the last before them to the other."""
+    breaks = np.array([1000, 2500])
+    borders = [(0.0, 999.0), (1000.0, 2499.0), (2500.0, 3999.0)]
+    line = np.concatenate(
+        [np.linspace(first, last, count) for (first, last), count in zip(borders, counts, strict=True)]
+    )
+    beside = np.repeat(np.array(borders).ravel(), 2)
+    active = np.arange(len(line) + len(beside)) < len(line)
+    held = held_parts(breaks, np.concatenate([line, beside]), active)
+    assert held.tolist() == [count >= 3 for count in counts]
 
 
 def test_a_break_where_nothing_moved_costs_little() -> None:

@@ -118,6 +118,15 @@ def test_what_displaces_an_ortho_image_is_followed_with_the_stated_accuracy(
     assert np.median([one.ce90_px for one in trials]) < 0.6 * affine
 
 
+def test_lines_and_samples_together_displace_an_ortho_image_and_its_points_none() -> None:
+    """What a scanner does depends on one of them; what points state of their errors is theirs."""
+    field = smooth(1, 0.2, 3.0)
+    followed, of_points = trial(1, image=field), trial(1, points=field, stated_px=3.0)
+    assert {one.along for one in followed.adjustment.components} == {"image"}
+    assert followed.ratio < WRONG
+    assert of_points.adjustment.components == ()
+
+
 @pytest.mark.monte_carlo
 def test_an_image_is_not_displaced_by_more_because_measures_are_better_than_they_state() -> None:
     """Between and beyond points it is off by what they show, at most."""
