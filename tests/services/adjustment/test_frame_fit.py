@@ -103,3 +103,11 @@ def test_what_neighbours_share_stays_in_the_frame() -> None:
 def test_control_that_disagrees_with_itself_is_refused_by_name() -> None:
     with pytest.raises(NoConsensus, match=r"of 12 control points disagree.*survey:"):
         drawn(np.random.default_rng(8), wrong=9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_known_ground_counts_where_more_than_half_of_it_agrees(seed: int) -> None:
+    fit, _ = drawn(np.random.default_rng([9, seed]), wrong=5)
+    assert fit.active.tolist() == [False] * 5 + [True] * 7
+    with pytest.raises(NoConsensus, match="6 of 12 control points disagree"):
+        drawn(np.random.default_rng([9, seed]), wrong=6)

@@ -11,7 +11,7 @@ from services.adjustment.displacement_components import Component
 from services.adjustment.moved_ground import moved_ground
 from services.adjustment.placed_measures import PlacedMeasures
 from services.adjustment.scene_motion import SceneMotion
-from services.types import Array, BoolArray
+from services.types import Array, BoolArray, IntArray
 
 SHAPE = (4000, 3000)
 COUNT = 90
@@ -153,15 +153,16 @@ def log_likelihood(
         left = fit.misfit[:, k] - design @ parameters
 
         def square_and_volume(
-            rows: Array, left: Array = left, covariance: Array = covariance
-        ) -> tuple[float, float]:
+            rows: IntArray, left: Array = left, covariance: Array = covariance
+        ) -> Array:
             law = covariance[np.ix_(rows, rows)]
-            return left[rows] @ np.linalg.solve(law, left[rows]), float(np.linalg.slogdet(law)[1])
+            return np.array([left[rows] @ np.linalg.solve(law, left[rows]), np.linalg.slogdet(law)[1]])
 
-        among = np.array(square_and_volume(np.flatnonzero(agreeing)))
-        laws += among.sum()
+        known = np.flatnonzero(agreeing)
+        among = square_and_volume(known)
+        laws += float(among.sum())
         for i, row in enumerate(np.flatnonzero(~agreeing)):
-            strays[k, :, i] = square_and_volume(np.append(np.flatnonzero(agreeing), row)) - among
+            strays[k, :, i] = square_and_volume(np.append(known, row)) - among
     return -0.5 * float(laws + np.minimum(strays[:, 0].sum(axis=0), 16.0).sum() + strays[:, 1].sum())
 
 

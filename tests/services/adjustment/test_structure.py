@@ -70,6 +70,28 @@ def test_the_best_of_many_shapes_is_charged_for_all_of_them(family: Family) -> N
     assert np.mean([one < 0.01 for one in chances]) < 0.03
 
 
+@pytest.mark.parametrize("family", ["lines", "steps", "samples", "seams", "image", "height"])
+def test_a_structure_is_the_same_wherever_the_points_lie_and_however_large_the_image_is(
+    family: Family,
+) -> None:
+    """Lines counted from another one, twice the pixels, twice the chips."""
+    residuals = independent(np.random.default_rng(77))
+    start, times = np.array([9000.0, -700.0]), 2.0
+    elsewhere = replace(
+        residuals,
+        line_sample=start + times * residuals.line_sample,
+        chip_side_px=times * residuals.chip_side_px,
+    )
+    here, there = (structures(one, (family,))[0] for one in (residuals, elsewhere))
+    assert there.chance == pytest.approx(here.chance, rel=1e-6)
+    assert there.shape == here.shape
+    np.testing.assert_allclose(there.size_px, here.size_px, rtol=1e-6)
+    if here.shape == "step":
+        assert there.at == pytest.approx(start[int(family == "seams")] + times * here.at)
+    elif here.shape == "period":
+        assert there.at == pytest.approx(times * here.at)
+
+
 @pytest.mark.parametrize("beside", [1, 2, 3, 8])
 def test_a_step_has_three_points_on_each_side(beside: int) -> None:
     residuals = independent(np.random.default_rng(74))

@@ -54,6 +54,16 @@ def test_no_points_give_no_figure(values):
     assert quantile.note == "no points"
 
 
+@pytest.mark.filterwarnings("error")
+def test_one_value_has_a_mean_and_no_standard_deviation():
+    """Nothing is divided by a freedom of nothing."""
+    of_one = statistics(np.array([np.nan, 3.0]))
+    assert (of_one.n, of_one.mean, of_one.rms) == (1, 3.0, 3.0)
+    assert np.isnan(of_one.std)
+    of_two = statistics(np.array([3.0, 5.0]))
+    assert of_two.std == pytest.approx(np.sqrt(2.0))
+
+
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=200))
 def test_a_quantile_lies_within_its_interval_and_its_sample(values):
     quantile = sample_quantile(np.array(values))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from services.errors import NotEnoughPoints
-from services.quality.cell_stability import CELLS, measure_cell_stability
-from services.quality.stability import measure_stability
+from services.quality.cell_stability import CELLS, cells_of, measure_cell_stability
+from services.quality.stability import PLACES, image_places, measure_stability
 
 pytestmark = pytest.mark.thorough
 
@@ -86,6 +86,18 @@ def test_every_active_point_is_held_out_once_with_its_whole_cell(registered):
     assert stability.held_out_px.xy.n == active.sum()
 
 
+def test_cells_divide_the_extent_of_the_points_wherever_in_the_image_it_lies(registered):
+    """Each cell is a quarter of the lines by a quarter of the samples that active points reach over."""
+    measures = registered(n=300).measures
+    here = cells_of(measures)
+    stretch, start = np.array([3.0, 0.5]), np.array([5000.0, 40.0])
+    moved = cells_of(replace(measures, line_sample=start + stretch * measures.line_sample))
+    assert len(here) == len(moved) == CELLS**2
+    for one, other in zip(here, moved, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.filterwarnings("error")
 def test_cells_without_solution_are_counted_and_without_any_there_is_a_note(registered):
     def refit(mask):
         raise NotEnoughPoints(3, 4)
@@ -106,3 +118,15 @@ def test_points_of_one_place_have_no_cells(registered):
         measure_cell_stability(alone.adjusted()).note
         == "1 active points in 1 cells leave none to hold out"
     )
+
+
+def test_the_places_of_displacements_are_the_middles_of_the_corner_pixels_and_of_the_image():
+    """Of 11 lines and 21 samples, around the image from the first pixel on, the middle at last."""
+    places = dict(zip(PLACES, image_places((11, 21)).tolist(), strict=True))
+    lines = {"top": 0.0, "bottom": 10.0}
+    samples = {"left": 0.0, "right": 20.0}
+    for name, place in places.items():
+        if name != "centre":
+            vertical, horizontal = name.split()
+            assert place == [lines[vertical], samples[horizontal]]
+    assert places["centre"] == [5.0, 10.0]

@@ -46,6 +46,14 @@ def test_the_size_of_a_structure_limits_the_verdict(
 
 
 @pytest.mark.parametrize("family", ["lines", "steps", "samples", "seams", "image", "height", "chips"])
+def test_a_structure_is_given_in_pixels_to_the_hundredth(family: Family) -> None:
+    """Measures tell no more than a hundredth of a pixel, and limits are tenths of it."""
+    criterion = judged(family, 5.0)
+    assert (criterion.unit, criterion.decimals) == ("px", 2)
+    assert "px" in criterion.note
+
+
+@pytest.mark.parametrize("family", ["lines", "steps", "samples", "seams", "image", "height", "chips"])
 def test_what_chance_explains_is_not_named_however_large(family: Family) -> None:
     criterion = judged(family, 50.0, chance=1e-3)
     assert criterion.met

@@ -65,7 +65,7 @@ def test_a_part_that_lies_elsewhere_counts_by_its_area_not_by_its_points(
     assert criterion.needed_for == needed_for
 
 
-@pytest.mark.parametrize(("n", "m"), [(3, 6), (4, 12), (5, 12), (8, 12)])
+@pytest.mark.parametrize(("n", "m"), [(3, 6), (4, 12), (5, 12), (8, 12), (14, 6), (21, 5)])
 def test_points_drawn_at_random_are_seldom_of_whole_lines(n: int, m: int) -> None:
     rng = np.random.default_rng([5, n, m])
     draws, seen = 20_000, 0

@@ -45,6 +45,16 @@ def test_a_clean_registration_is_good(registered):
     assert failed(result) == set()
 
 
+def test_criteria_show_hundredths_of_pixels_and_metres_and_whole_percents(registered):
+    """What a reader compares with a limit has the digits in which limits are given."""
+    criteria = qualified(registered()).criteria
+    digits = {"px": 2, "m": 2, "%": 0}
+    of_a_unit = [one for one in criteria if one.unit]
+    assert {one.unit for one in of_a_unit} >= {"px", "%"}
+    for one in of_a_unit:
+        assert one.decimals == digits[one.unit], one.name
+
+
 def test_visible_matched_and_active_points_are_counted(registered):
     counts = count_points(registered(n=60, lost=8, wrong=4).measures)
     assert (counts.visible, counts.matched) == (60, 52)
