@@ -129,6 +129,7 @@ def test_what_was_not_measured_is_not_shown_and_says_what_is_missing() -> None:
     criteria = judged(BlockRequirements(ce90_m=1.0, le90_m=1.0))
     for name, option in (("ce90_m", "--site"), ("le90_m", "--dem")):
         assert criteria[name].outcome == "not shown"
+        assert criteria[name].unit == "m"
         assert np.isnan(criteria[name].value)
         assert option in criteria[name].note
 

@@ -80,3 +80,14 @@ def test_an_outline_across_the_antimeridian_counts_points_of_both_sides():
 def test_points_on_the_edge_of_the_outline_belong_to_its_last_cell():
     cells = density_cells(np.array([[5.2, 43.1], [5.0, 43.0]]), rectangle(5.0, 43.0, 5.2, 43.1))
     assert_array_equal(cells.points, [1, 1])
+
+
+def test_points_beside_the_outline_belong_to_no_cell():
+    """Half a cell, a whole one and a hundredth of one beyond each of its sides."""
+    beyond = np.array([0.05, 0.1, 0.001])
+    inside = np.full(3, 0.05)
+    west_south = np.concatenate([-beyond, inside])
+    lon_lat = np.column_stack([5.0 + west_south, 43.0 + west_south[::-1]])
+    east_north = np.column_stack([5.2 + np.append(beyond, -inside), 43.1 + np.append(-inside, beyond)])
+    cells = density_cells(np.concatenate([lon_lat, east_north]), rectangle(5.0, 43.0, 5.2, 43.1))
+    assert_array_equal(cells.points, [0, 0])

@@ -84,6 +84,15 @@ def test_a_step_says_where_it_is_and_what_it_looks_like(family: Family, words: s
     assert words in judged(family, 5.0, shape="step").note
 
 
+@pytest.mark.parametrize(("period", "cause"), [(3900.0, "attitude jitter"), (4100.0, "a bow")])
+def test_a_swing_longer_than_the_lines_of_an_image_is_a_bow(period: float, cause: str) -> None:
+    """However many samples it has."""
+    swing = Structure("lines", 1e-9, "period", period, np.full(2, 2.0), 4.0, np.full(2, np.nan))
+    for samples in (500, 30_000):
+        (criterion,) = structure_criteria([swing], SIGHT, (SHAPE[0], samples), PREDICTED_PX)
+        assert cause in criterion.note
+
+
 LINES = 2000
 BREAKS = np.array([500, 1500])
 

@@ -35,6 +35,14 @@ def test_one_far_point_does_not_hide_lost_lines(others: np.ndarray, along: float
     assert judged(line, others, (along, 0.6)) == "usable"
 
 
+@pytest.mark.parametrize("far", [[1748.0, 1900.0], [12.0, 1900.0], [12.0, 30.0]])
+def test_two_far_points_are_no_chance_beside_lost_lines(far: list[float]) -> None:
+    line = np.array([384.0, 446.0, 536.0, 560.0, *far])
+    others = np.concatenate([np.linspace(32.0, 370.0, 20), np.linspace(570.0, 1890.0, 40)])
+    assert judged(line, others, (19.3, 0.6)) == "good"
+    assert judged(line[:-1], others, (19.3, 0.6)) == "usable"
+
+
 def test_ground_that_moved_across_the_lines_is_judged_by_all_its_points(others: np.ndarray) -> None:
     line = np.array([84.0, 146.0, 236.0, 1748.0])
     assert judged(line, others, (19.3, 11.0)) == "good"

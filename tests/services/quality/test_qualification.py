@@ -332,6 +332,19 @@ def test_a_user_sets_a_limit_in_metres_alone(registered):
     assert limit * GSD_M == pytest.approx(2.5)
 
 
+@pytest.mark.parametrize("gsd_m", [0.1, 0.5, 10.0])
+@pytest.mark.parametrize("needed_for", ["good", "usable"])
+@pytest.mark.parametrize("name", ["displacement", "ce90"])
+def test_a_limit_is_the_larger_of_one_in_pixels_and_one_in_metres(registered, name, needed_for, gsd_m):
+    """Fine pixels are held to metres on the ground, coarse ones to parts of themselves."""
+    options = replace(DEFAULT, **{f"{needed_for}_{name}_px": 3.0, f"{needed_for}_{name}_m": 1.5})
+    scene = replace(registered().adjusted(), gsd_m=gsd_m, control_gsd_m=gsd_m)
+    criteria = qualify(scene, options, np.random.default_rng(3)).criteria
+    of_name = {"displacement": "displacement_px", "ce90": "predicted_ce90_px"}[name]
+    (limit_px,) = [c.limit for c in criteria if (c.name, c.needed_for) == (of_name, needed_for)]
+    assert limit_px * gsd_m == pytest.approx(max(1.5, 3.0 * gsd_m))
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_points_worse_than_stated_make_a_scene_usable_that_says_so(registered, seed):
     """60 points of 2.5 px that state 1 px: what the scene shows of them is in its accuracy."""
