@@ -24,10 +24,13 @@ def a_model(azimuth_deg: float = 75.0) -> PushbroomModel:
     return pushbroom_over(target, SHAPE, 2.5, view, (0.0, 1500.0), jitter_px=0.5, rng=rng)
 
 
-def with_a_mirror(model: PushbroomModel) -> PushbroomModel:
-    """The same with central tangents along and across of 0.01 and 0.4, as SPOT 1 to 5 have them."""
+def with_a_mirror(model: PushbroomModel, ahead: float = 0.01) -> PushbroomModel:
+    """The same with central tangents along and across of 0.01 and 0.4, as SPOT 1 to 5 have them.
+
+    Cameras for stereo look ahead and back by a tangent of some tenths.
+    """
     look = model.look.coefficients.copy()
-    look[:, :, -1] += [0.01, 0.4]
+    look[:, :, -1] += [ahead, 0.4]
     return replace(model, look=replace(model.look, coefficients=look))
 
 
@@ -51,8 +54,10 @@ def ground_in(model: PushbroomModel, count: int = 60) -> np.ndarray:
         a_model(250.0),
         replace(a_model(), light_path=LightPath(True, True, True)),
         with_a_bent_detector(a_model()),
+        with_a_mirror(a_model(), ahead=0.15),
+        with_a_mirror(a_model(), ahead=-0.15),
     ],
-    ids=["east", "west", "light", "bent"],
+    ids=["east", "west", "light", "bent", "ahead", "back"],
 )
 @pytest.mark.parametrize("term", range(len(TERMS)), ids=TERMS)
 def test_derivatives_agree_with_differences_of_exact_models(model: PushbroomModel, term: int) -> None:
