@@ -270,6 +270,27 @@ def test_control_points_of_another_instrument_are_refused() -> None:
     assert adjust_block([right], shown, control=control, options=alone).control_active.all()
 
 
+@pytest.mark.parametrize("number", [0, 2])
+def test_an_image_that_shows_most_control_elsewhere_is_refused_whichever_it_is(number: int) -> None:
+    """Beside an image whose accuracy is a guess, which shows control as well; half may be wrong."""
+    images, rng = mixed(), np.random.default_rng([6, number])
+    truth = Truth(images, drawn(images, rng), ground(rng))
+    control = truth.control(rng, np.arange(40), (0.5, 0.5), Frame.from_sigmas(1.0, 1.0))
+    seen = truth.observed(rng, NOISE_PX)
+    of_image = np.flatnonzero((seen.image == number) & (seen.point < 40))
+    half = len(of_image) // 2
+    assert half > 5
+
+    def block_of(wrong: int) -> BlockAdjustment:
+        line_sample = seen.line_sample.copy()
+        line_sample[of_image[:wrong]] += 500.0
+        return adjust_block(images, replace(seen, line_sample=line_sample), control=control)
+
+    with pytest.raises(InputError, match=rf"image {number + 1}: {half + 1} of {len(of_image)} control"):
+        block_of(half + 1)
+    assert not block_of(half).active[of_image[:half]].any()
+
+
 def test_an_exact_frame_and_many_points_leave_the_noise_alone() -> None:
     images, observations, control = single(SRP, 60)
     block = adjust_block(images, replace(observations), control=control, options=alone)
