@@ -106,6 +106,19 @@ def test_blocks_of_a_compression_are_no_breaks() -> None:
     assert not found(pixels + blocks.astype(np.float32))
 
 
+@pytest.mark.parametrize(("every", "told"), [(40, False), (200, True)])
+def test_lines_that_differ_no_more_than_others_of_the_image_are_no_breaks(
+    every: int, told: bool
+) -> None:
+    """Seven of 300 lines begin other ground, as tiles of a compression would: none of them is broken."""
+    lines = np.arange(every, 300, every)
+    for seed in range(4):
+        pixels = np.concatenate(
+            [ground(10 * seed + k, (300, SAMPLES))[:every] for k in range(len(lines) + 1)]
+        )[:300]
+        assert found(pixels) == (lines.tolist() if told else [])
+
+
 def test_an_edge_of_the_ground_along_a_line_is_no_break() -> None:
     pixels = ground(5)
     pixels[450:, : SAMPLES // 3] += 400.0
