@@ -7,6 +7,7 @@ import pytest
 from scipy.linalg import null_space
 from scipy.stats import multivariate_normal
 
+from services.adjustment.affine_fit import AffineFit
 from services.adjustment.displacement_components import (
     MAX_CHANCE,
     Component,
@@ -15,6 +16,9 @@ from services.adjustment.displacement_components import (
     with_components,
 )
 from services.adjustment.displacement_solution import agreeing_with, by_affine, solve_displacement
+from services.adjustment.placed_measures import PlacedMeasures
+from services.adjustment.scene_solution import AgreeingMeasures
+from services.adjustment.shared_errors import SharedErrors
 from services.adjustment.structure import Residuals, structures
 from services.sensors.correction import no_correction
 from services.types import Array, BoolArray
@@ -231,3 +235,32 @@ def test_a_displacement_covers_the_points_and_the_image_wherever_the_model_expec
         assert nodes[-1] >= places.max() - own_px
         assert nodes[0] >= min(places.min(), 0.0) - own_px
         assert nodes[-1] <= max(places.max(), last[axis]) + own_px
+
+
+@pytest.mark.parametrize("times", [0.2, 5.0])
+def test_what_measures_state_scales_the_accuracy_of_a_motion_and_leaves_the_motion(times: float) -> None:
+    """A component is as large as the residuals show it, in the units of what is stated."""
+    residuals = moved(measures(8), SMOOTH, 8)
+    n, frame = len(residuals.misfit), no_correction(SHAPE)
+    t = (residuals.line_sample - frame.centre) / frame.half_size
+    variance = np.diagonal(residuals.covariance, 0, 1, 2).T
+    fit = AffineFit(t, residuals.misfit, variance, np.zeros((n, 0)), np.zeros((2, 0)))
+    measured = PlacedMeasures(
+        residuals.line_sample, np.zeros(n), np.zeros(2), 0.0, np.eye(n), CHIP_PX, SHAPE, scanned=True
+    )
+    independent = SharedErrors(1.0, np.zeros(3), 0.0)
+    as_shown, stated = (
+        AgreeingMeasures(
+            measured, fit, fit.scaled(scale), np.ones(n, dtype=np.bool_), independent, 4.0
+        ).displaced(np.zeros((2, 3)), (SMOOTH,))
+        for scale in (1.0, times**2)
+    )
+    places = np.random.default_rng(9).random((50, 2)) * (np.array(SHAPE) - 1.0)
+    np.testing.assert_allclose(stated.parameters, as_shown.parameters, atol=1e-6)
+    np.testing.assert_allclose(stated.covariance, times**2 * as_shown.covariance, rtol=1e-6, atol=1e-9)
+    assert as_shown.displacement is not None
+    assert stated.displacement is not None
+    np.testing.assert_allclose(
+        stated.displacement.at(places), as_shown.displacement.at(places), atol=1e-6
+    )
+    assert stated.sigma0 == pytest.approx(as_shown.sigma0 / times, rel=1e-6)

@@ -6,8 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from services.adjustment.affine_fit import AffineFit
 from services.adjustment.control_observations import ControlObservations
 from services.adjustment.image_correction import SceneAdjustment, adjust_scene
+from services.adjustment.placed_measures import PlacedMeasures
 from services.map_grid import MapGrid
 from services.quality.accuracy import normalised_error
 from services.quality.normal_law import normal_ce90
@@ -118,13 +120,25 @@ def test_what_displaces_an_ortho_image_is_followed_with_the_stated_accuracy(
     assert np.median([one.ce90_px for one in trials]) < 0.6 * affine
 
 
-def test_lines_and_samples_together_displace_an_ortho_image_and_its_points_none() -> None:
+@pytest.mark.parametrize(
+    ("scanned", "points_px", "along"),
+    [(False, 0.1, {"image"}), (False, 3.0, set()), (True, 0.1, set())],
+)
+def test_lines_and_samples_together_displace_an_ortho_image_alone(
+    scanned: bool, points_px: float, along: set[str]
+) -> None:
     """What a scanner does depends on one of them; what points state of their errors is theirs."""
-    field = smooth(1, 0.2, 3.0)
-    followed, of_points = trial(1, image=field), trial(1, points=field, stated_px=3.0)
-    assert {one.along for one in followed.adjustment.components} == {"image"}
-    assert followed.ratio < WRONG
-    assert of_points.adjustment.components == ()
+    rng, count = np.random.default_rng(1), 80
+    t = rng.uniform(-1.0, 1.0, (count, 2))
+    place = (np.array(SHAPE) - 1.0) / 2.0 + t * np.array(SHAPE) / 2.0
+    misfit = smooth(1, 0.2, 3.0)(place) + SIGMA_PX * rng.normal(size=(count, 2))
+    fit = AffineFit(t, misfit, np.full((count, 2), SIGMA_PX**2), np.zeros((count, 0)), np.zeros((2, 0)))
+    measured = PlacedMeasures(
+        place, np.zeros(count), np.zeros(2), points_px**2, np.eye(count), CHIP_PX, SHAPE, scanned
+    )
+    components, _ = measured.components(fit, np.ones(count, dtype=np.bool_))
+    assert {one.along for one in components} - {"lines", "samples"} == along
+    assert scanned or len(components) == len(along)
 
 
 @pytest.mark.monte_carlo
