@@ -55,7 +55,7 @@ def test_no_points_give_no_figure(values):
 
 
 @pytest.mark.filterwarnings("error")
-def test_one_value_has_a_mean_and_no_standard_deviation():
+def test_one_value_has_a_mean_and_no_standard_deviation() -> None:
     """Nothing is divided by a freedom of nothing."""
     of_one = statistics(np.array([np.nan, 3.0]))
     assert (of_one.n, of_one.mean, of_one.rms) == (1, 3.0, 3.0)

@@ -1,5 +1,6 @@
 """Hold-outs by cells show errors that neighbours share, which hold-outs at random cannot."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from services.errors import NotEnoughPoints
 from services.quality.cell_stability import CELLS, cells_of, measure_cell_stability
 from services.quality.stability import PLACES, image_places, measure_stability
+from tests.services.conftest import Registered
 
 pytestmark = pytest.mark.thorough
 
@@ -86,7 +88,9 @@ def test_every_active_point_is_held_out_once_with_its_whole_cell(registered):
     assert stability.held_out_px.xy.n == active.sum()
 
 
-def test_cells_divide_the_extent_of_the_points_wherever_in_the_image_it_lies(registered):
+def test_cells_divide_the_extent_of_the_points_wherever_in_the_image_it_lies(
+    registered: Callable[..., Registered],
+) -> None:
     """Each cell is a quarter of the lines by a quarter of the samples that active points reach over."""
     measures = registered(n=300).measures
     here = cells_of(measures)
@@ -120,7 +124,7 @@ def test_points_of_one_place_have_no_cells(registered):
     )
 
 
-def test_the_places_of_displacements_are_the_middles_of_the_corner_pixels_and_of_the_image():
+def test_the_places_of_displacements_are_the_middles_of_the_corner_pixels_and_of_the_image() -> None:
     """Of 11 lines and 21 samples, around the image from the first pixel on, the middle at last."""
     places = dict(zip(PLACES, image_places((11, 21)).tolist(), strict=True))
     lines = {"top": 0.0, "bottom": 10.0}

@@ -82,7 +82,7 @@ def test_points_on_the_edge_of_the_outline_belong_to_its_last_cell():
     assert_array_equal(cells.points, [1, 1])
 
 
-def test_points_beside_the_outline_belong_to_no_cell():
+def test_points_beside_the_outline_belong_to_no_cell() -> None:
     """Half a cell, a whole one and a hundredth of one beyond each of its sides."""
     beyond = np.array([0.05, 0.1, 0.001])
     inside = np.full(3, 0.05)

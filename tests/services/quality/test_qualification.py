@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,9 +46,12 @@ def test_a_clean_registration_is_good(registered):
     assert failed(result) == set()
 
 
-def test_criteria_show_hundredths_of_pixels_and_metres_and_whole_percents(registered):
+def test_criteria_show_hundredths_of_pixels_and_metres_and_whole_percents(
+    registered: Callable[..., Registered],
+) -> None:
     """What a reader compares with a limit has the digits in which limits are given."""
-    criteria = qualified(registered()).criteria
+    scene = registered().adjusted()
+    criteria = qualify(scene, DEFAULT, np.random.default_rng(3)).criteria
     digits = {"px": 2, "m": 2, "%": 0}
     of_a_unit = [one for one in criteria if one.unit]
     assert {one.unit for one in of_a_unit} >= {"px", "%"}
@@ -335,9 +339,12 @@ def test_a_user_sets_a_limit_in_metres_alone(registered):
 @pytest.mark.parametrize("gsd_m", [0.1, 0.5, 10.0])
 @pytest.mark.parametrize("needed_for", ["good", "usable"])
 @pytest.mark.parametrize("name", ["displacement", "ce90"])
-def test_a_limit_is_the_larger_of_one_in_pixels_and_one_in_metres(registered, name, needed_for, gsd_m):
+def test_a_limit_is_the_larger_of_one_in_pixels_and_one_in_metres(
+    registered: Callable[..., Registered], name: str, needed_for: str, gsd_m: float
+) -> None:
     """Fine pixels are held to metres on the ground, coarse ones to parts of themselves."""
-    options = replace(DEFAULT, **{f"{needed_for}_{name}_px": 3.0, f"{needed_for}_{name}_m": 1.5})
+    limits: dict[str, Any] = {f"{needed_for}_{name}_px": 3.0, f"{needed_for}_{name}_m": 1.5}
+    options = replace(DEFAULT, **limits)
     scene = replace(registered().adjusted(), gsd_m=gsd_m, control_gsd_m=gsd_m)
     criteria = qualify(scene, options, np.random.default_rng(3)).criteria
     of_name = {"displacement": "displacement_px", "ce90": "predicted_ce90_px"}[name]
