@@ -195,6 +195,15 @@ def test_the_variance_of_unit_weight_is_one_of_few_points_as_well() -> None:
     )
 
 
+def test_affine_parameters_displace_places_as_a_correction_of_them_does() -> None:
+    """A constant in the middle of the image, and what is added to it at its last line and sample."""
+    rng = np.random.default_rng(11)
+    places = rng.uniform(-0.5, 1.5, (40, 2)) * SHAPE
+    correction = replace(no_correction(SHAPE), parameters=rng.normal(0.0, 5.0, (2, 3)))
+    moved_px = by_affine(places, no_correction(SHAPE)) @ correction.parameters.T
+    np.testing.assert_allclose(places + moved_px, correction.apply(places), atol=1e-9)
+
+
 def some_wrong(seed: int) -> tuple[Residuals, BoolArray]:
     """Measures of an image that moves smoothly, and which (n,) of them lie off by 12 to 20 sigmas."""
     residuals = moved(measures(seed), SMOOTH, seed)
