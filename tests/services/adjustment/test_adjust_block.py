@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, f
 
+from services.adjustment.affine_fit import ORDERS, Order
 from services.adjustment.block_problem import BlockOptions
 from services.adjustment.bundle import BlockAdjustment, adjust_block
 from services.adjustment.intersection import intersect
 from services.adjustment.parameters import image_parameters
 from services.errors import NoConvergence, NotEnoughPoints
 from services.sensors.correction import CorrectedModel
+from services.sensors.displacement import DisplacementGrid
 from services.simulation.view import ViewGeometry
 from services.types import Array, Observations
 from tests.services.simulated import ring_of_geometries
@@ -305,6 +307,31 @@ def test_the_share_that_observations_tell_of_a_parameter_is_what_they_take_off_i
     np.testing.assert_allclose(block.determined, 1.0 - variance / prior_px**2, atol=0.01)
     slopes = block.determined[:, [1, 2, 4, 5]]
     assert 0.05 < slopes.min() < slopes.max() < 0.95
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("displaced", [False, True])
+def test_parameters_show_the_ground_where_the_corrected_model_does(
+    five: list[ViewGeometry], order: Order, displaced: bool
+) -> None:
+    """And its derivatives are those of differences, in pixels at the edge of the image."""
+    view, rng = five[0], np.random.default_rng(12)
+    nodes = [np.linspace(0.0, size - 1.0, 5) for size in view.plan.shape]
+    moved = rng.normal(0.0, 3.0, (5, 5, 2)) if displaced else np.zeros((5, 5, 2))
+    grid = DisplacementGrid(nodes[0], nodes[1], moved, np.zeros_like(moved))
+    image = image_parameters(
+        "one", view.rpc, view.plan.shape, shift_px=4.0, slope_px=1.0, order=order, displacement=grid
+    )
+    ground = view.rpc.locate(rng.uniform(0.0, 1.0, (30, 2)) * view.plan.shape, np.full(30, 180.0))
+    values = rng.normal(0.0, image.sigma)
+    shown = image.computed(values, ground)
+    np.testing.assert_allclose(
+        shown.line_sample, image.corrected(values).project(ground), atol=a_millipixel
+    )
+    for k in range(len(values)):
+        step = np.where(np.arange(len(values)) == k, 0.5, 0.0)
+        after, before = (image.corrected(values + sign * step).project(ground) for sign in (1.0, -1.0))
+        np.testing.assert_allclose(shown.by_parameters[:, :, k], after - before, atol=a_millipixel)
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])
