@@ -14,7 +14,7 @@ from services.adjustment.bundle import adjust_block
 from services.adjustment.control_check import agreeing_control
 from services.adjustment.control_ground import ControlGround
 from services.adjustment.parameters import AdjustableImage, block_priors, image_parameters
-from services.adjustment.robust_start import robust_start
+from services.adjustment.robust_start import active_observations, robust_start
 from services.geodesy import move_metres
 from services.types import Array, BoolArray, Frame, Observations
 from tests.services.simulated import ring_of_geometries
@@ -133,3 +133,29 @@ def test_of_points_that_took_no_part_the_best_comes_back_first(block: Block) -> 
     moved = block.moved(np.array([0.9, 0.0, 0.0]))
     assert moved.judged(of_two).tolist() == ALL_BUT_THE_FIRST.tolist()
     assert moved.judged(ALL_BUT_THE_FIRST).tolist() == ALL.tolist()
+
+
+@pytest.mark.parametrize("agrees", [True, False])
+@pytest.mark.parametrize("known", [(True, True, True), (True, True, False), (False, False, True)])
+def test_a_single_ray_holds_a_point_whose_position_is_known_and_agrees(
+    block: Block, known: tuple[bool, ...], agrees: bool
+) -> None:
+    """A height alone checks no ray, and other points need two."""
+    variance = np.where(np.diag(known), block.control.covariance_m2, 0.0)
+    unknown = np.diag(np.where(known, 0.0, np.inf))
+    control = replace(block.control, covariance_m2=np.where(unknown > 0.0, np.inf, variance))
+    priors = block_priors(block.images, [], control.frame_covariances())
+    seen = block.observations
+    n_points = int(seen.point[-1]) + 1
+    problem = BlockProblem(block.images, seen, control, BlockOptions(), n_points, priors.size)
+    of_known, of_other = 0, KNOWN + 3
+    first = np.concatenate([[True], np.diff(seen.point) > 0])
+    far = np.isin(seen.point, [of_known, of_other]) & ~first
+    square = np.where(far, 1e6, 1.0)
+    left = active_observations(
+        problem, square, np.ones(len(seen), dtype=np.bool_), 1.0, np.full(KNOWN, agrees)
+    )
+    checked = agrees and known[0]
+    expected = ~np.isin(seen.point, [of_known, of_other])
+    expected |= first & (seen.point == of_known) & checked
+    assert left.tolist() == expected.tolist()
