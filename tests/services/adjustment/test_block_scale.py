@@ -84,6 +84,24 @@ def test_both_first_scales_are_that_of_the_noise_where_nothing_is_wrong(
     assert robust_scale(square, point, coordinates) == pytest.approx(NOISE, rel=0.04)
 
 
+@pytest.mark.parametrize("times", [0.4, 1.0, 3.0])
+def test_residuals_times_as_large_have_a_scale_times_as_large(times: float) -> None:
+    """Observations may be better than they state, down to six tenths here."""
+    rng = np.random.default_rng(9)
+    point, coordinates = np.repeat(np.arange(400), 5), np.full(400, 3.0)
+    square = residuals_of_rays(rng, 5, 400, 0.05)
+    larger = times**2 * square
+    assert low_scale(larger, point, coordinates) == pytest.approx(
+        times * low_scale(square, point, coordinates)
+    )
+    assert robust_scale(larger, point, coordinates) == pytest.approx(
+        times * robust_scale(square, point, coordinates), rel=5e-3
+    )
+    assert posterior_scale(larger, point, coordinates, 0.0) == pytest.approx(
+        times * posterior_scale(square, point, coordinates, 0.0), rel=5e-3
+    )
+
+
 def test_a_tenth_of_wrong_rays_makes_no_first_scale_twice_as_large() -> None:
     rng = np.random.default_rng(7)
     point, coordinates = np.repeat(np.arange(600), 6), np.full(600, 3.0)
