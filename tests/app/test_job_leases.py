@@ -19,6 +19,18 @@ from tests.app.job_queue import LEASE_S, claimed, let_lease_lapse, new_job, stat
 from tests.statements import run_sql
 
 
+def in_transaction(
+    change: Callable[[Connection, Job], object],
+) -> Callable[[Database, Job], None]:
+    """A change of a job, in a transaction of its own."""
+
+    def changed(database: Database, job: Job) -> None:
+        with database.transaction() as connection:
+            change(connection, job)
+
+    return changed
+
+
 def test_a_job_is_claimed_by_one_worker_only(database: Database):
     new_job(database)
     with ThreadPoolExecutor(6) as threads:
@@ -173,6 +185,78 @@ def test_a_job_that_outlives_too_many_workers_fails(database: Database):
     assert failed.state == "failed"
     assert failed.error is not None
     assert f"died {FAILURES_ALLOWED} times" in failed.error["detail"]
+
+
+def lost_for_good(database: Database, job: Job) -> None:
+    """The job loses as many workers as it may."""
+    for attempt in range(1, FAILURES_ALLOWED + 1):
+        if attempt > 1:
+            claimed(database, job.id)
+        let_lease_lapse(database, job.id)
+        sweep_jobs(database, LEASE_S)
+
+
+ENDS: dict[str, Callable[[Database, Job], object]] = {
+    "succeeds": in_transaction(lambda c, job: attempts.succeed(c, job.id, job.attempt, {})),
+    "fails": in_transaction(lambda c, job: attempts.fail(c, job.id, job.attempt, {"title": "no"})),
+    "is dismissed": in_transaction(lambda c, job: jobs.dismiss(c, job.id)),
+    "loses its workers": lost_for_good,
+}
+RETURNS: dict[str, Callable[[Database, Job], object]] = {
+    "given back": in_transaction(lambda c, job: attempts.give_back(c, job.id, job.attempt)),
+    "tried again": in_transaction(lambda c, job: attempts.try_again(c, job.id, job.attempt, 0.0)),
+    "loses a worker": lambda database, job: (
+        let_lease_lapse(database, job.id),
+        sweep_jobs(database, LEASE_S),
+    ),
+}
+
+
+def lease_and_worker(database: Database, job: Job) -> tuple[object, object]:
+    with database.transaction() as connection:
+        row = run_sql(
+            connection, "select lease_until, worker from job where id = %s", [job.id]
+        ).fetchone()
+    assert row is not None
+    return row["lease_until"], row["worker"]
+
+
+@pytest.mark.parametrize("end", ENDS.values(), ids=ENDS)
+def test_a_job_that_has_ended_has_its_end_and_no_lease(
+    database: Database, end: Callable[[Database, Job], object]
+):
+    job, other = (claimed(database, new_job(database).id) for _ in range(2))
+    end(database, job)
+    ended = state_of(database, job.id)
+    assert ended.finished_at is not None
+    assert ended.started_at is not None
+    assert ended.started_at <= ended.finished_at <= ended.updated_at
+    assert lease_and_worker(database, job)[0] is None
+    untouched = state_of(database, other.id)
+    assert (untouched.state, untouched.finished_at, untouched.error) == ("running", None, None)
+
+
+@pytest.mark.parametrize("back", RETURNS.values(), ids=RETURNS)
+def test_a_job_that_waits_again_has_neither_end_nor_lease_nor_worker(
+    database: Database, back: Callable[[Database, Job], object]
+):
+    job = claimed(database, new_job(database).id)
+    back(database, job)
+    waiting = state_of(database, job.id)
+    assert (waiting.state, waiting.finished_at) == ("accepted", None)
+    assert "waiting" in waiting.message
+    assert lease_and_worker(database, job) == (None, None)
+    assert claimed(database, job.id).attempt == job.attempt + 1
+
+
+def test_a_job_that_has_lost_too_many_workers_says_so_in_problem_details(database: Database):
+    job = claimed(database, new_job(database).id)
+    lost_for_good(database, job)
+    failed = state_of(database, job.id)
+    assert failed.error is not None
+    assert {"type", "title", "detail"} <= failed.error.keys()
+    assert failed.error["failures"] == failed.failures == FAILURES_ALLOWED
+    assert failed.message == failed.error["detail"]
 
 
 def test_a_lease_that_is_renewed_is_not_taken_back(database: Database):

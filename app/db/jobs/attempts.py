@@ -243,7 +243,7 @@ def take_back(connection: Connection, failures_allowed: int) -> list[UUID]:
         connection.execute(
             update(job)
             .where(job.c.id == lost.id)
-            .values(state="failed", message=detail, error=error, finished_at=clock)
+            .values(state="failed", message=detail, error=error, finished_at=clock, updated_at=clock)
         )
         replace_spent_ticket(connection)
     return [lost.id for lost in lapsed]
