@@ -95,6 +95,25 @@ def test_a_job_that_needs_more_than_it_may_have_fails_at_once(worker: Worker, co
 
 
 @pytest.mark.parametrize(
+    ("code", "setting", "variable", "named"),
+    [
+        (OUT_OF_MEMORY, {"job_memory_bytes": 3 << 30}, "AMERS_JOB_MEMORY_BYTES", "3072 MiB"),
+        (FILE_TOO_LARGE, {"job_file_bytes": 5 << 30}, "AMERS_JOB_FILE_BYTES", "5120 MiB"),
+        (None, {"job_seconds": 0.1}, "AMERS_JOB_SECONDS", "0.1 s"),
+    ],
+)
+def test_a_job_that_may_not_have_more_says_how_much_and_by_which_setting(
+    worker: Worker, code: int | None, setting: dict[str, float], variable: str, named: str
+):
+    worker.settings = worker.settings.model_copy(update=setting)
+    error = worker.attempt_ends(code).error
+    assert error is not None
+    assert {"type", "title", "detail"} <= error.keys()
+    assert variable in error["detail"]
+    assert f" {named}," in error["detail"]
+
+
+@pytest.mark.parametrize(
     ("code", "title"), [(CRASH, "Internal error"), (1, "Internal error"), (NO_ROOM, "No room")]
 )
 def test_a_job_whose_process_broke_off_is_tried_three_times(worker: Worker, code: int, title: str):

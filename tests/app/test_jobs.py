@@ -1,5 +1,6 @@
 """Jobs and their callers: requests, visibility, dismissal and quotas."""
 
+import json
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,13 +13,16 @@ from fastapi.testclient import TestClient
 
 from app.config import Settings
 from app.db import engine
-from app.db.engine import Database
+from app.db.engine import Connection, Database
 from app.db.jobs import attempts, jobs
-from app.errors import DamagedFile
+from app.errors import AmersError, Conflict, DamagedFile, NoSuchJob
 from app.main import create_app
 from app.storage import Storage
-from app.usecases.jobs import PROCESSES, error_details
+from app.usecases.jobs import PROCESSES, error_details, success_message
+from services.errors import FormatError, NotEnoughPoints
+from services.formats.block.problems import BlockProblems, Problem
 from tests.app.job_queue import LEASE_S, claimed, tickets
+from tests.statements import run_sql
 
 Bearer = Callable[[str], dict[str, str]]
 EXECUTE = "/processes/register-scene/execution"
@@ -287,6 +291,71 @@ def test_the_error_of_a_job_names_files_and_no_folder_of_the_machine(tmp_path: P
     assert str(tmp_path) not in details["detail"]
     assert gettempdir() not in details["detail"]
     assert all(name in details["detail"] for name in ("a.tif", "a.json", "b.tif cannot be read"))
+
+
+@pytest.mark.parametrize(
+    "error", [NotEnoughPoints(3, 6), NoSuchJob("no job"), Conflict("taken"), FormatError("no block")]
+)
+def test_the_title_of_an_error_is_its_name_in_words(tmp_path: Path, error: AmersError):
+    details = error_details(error, Storage(tmp_path / "storage"))
+    words = details["title"].split(" ")
+    assert "".join(words).lower() == details["error"].lower() == type(error).__name__.lower()
+    assert len(words) == sum(letter.isupper() for letter in details["error"])
+    assert [letter for letter in details["title"] if letter.isupper()] == [details["title"][0]]
+
+
+def test_the_error_of_a_job_has_the_numbers_and_problems_that_it_is_about(tmp_path: Path):
+    storage = Storage(tmp_path / "storage")
+    few = error_details(NotEnoughPoints(3, 6), storage)
+    assert (few["found"], few["needed"]) == (3, 6)
+    assert "problems" not in few
+    row = Problem("points.parquet", "lon", 7, "181.0", "-180 to 180")
+    broken = error_details(BlockProblems((row,), 30), storage)
+    assert broken["count"] == 30
+    (listed,) = broken["problems"]
+    assert (listed["file"], listed["row"], listed["found"]) == (row.file, row.row, row.found)
+    json.dumps(broken)
+
+
+def test_the_last_message_of_a_job_warns_of_a_model_that_must_not_be_used():
+    assert success_message({"files": {}}) == "done"
+    for verdict in ("good", "usable"):
+        assert success_message({"verdict": verdict}) == f"done, verdict {verdict}"
+    assert "do not use" in success_message({"verdict": "failed"})
+
+
+def test_a_job_shows_its_last_thousand_messages(
+    client: TestClient, me: dict[str, str], scene: str, connection: Connection
+):
+    job = client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=me).json()["jobID"]
+    run_sql(
+        connection,
+        "insert into job_message (job_id, attempt, progress, message)"
+        " select %s, 1, 50, 'block ' || n from generate_series(1, 1500) n",
+        [job],
+    )
+    connection.commit()
+    shown = client.get(f"/jobs/{job}/messages", headers=me).json()["messages"]
+    assert [one["message"] for one in shown] == [f"block {n}" for n in range(501, 1501)]
+
+
+@pytest.mark.parametrize(("length", "status"), [(0, 422), (1, 201), (200, 201), (201, 422)])
+def test_an_idempotency_key_has_one_to_two_hundred_characters(
+    client: TestClient, me: dict[str, str], scene: str, length: int, status: int
+):
+    keyed = me | {"Idempotency-Key": "k" * length}
+    reply = client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=keyed)
+    assert reply.status_code == status
+
+
+def test_a_job_names_all_of_its_scenes(client: TestClient, me: dict[str, str], scene: str):
+    second = client.post("/scenes?name=b.tif", content=b"II*\0" + bytes(100), headers=me).json()["id"]
+    both = {"inputs": {"scenes": [second, scene]}}
+    together = client.post("/processes/register-scenes/execution", json=both, headers=me).json()
+    alone = client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=me).json()
+    listed = {job["jobID"]: job for job in client.get("/jobs", headers=me).json()["jobs"]}
+    assert listed[together["jobID"]]["amers:sceneNames"] == ["b.tif", "a.tif"]
+    assert listed[alone["jobID"]]["amers:sceneNames"] == ["a.tif"]
 
 
 def test_jobs_are_listed_page_by_page_and_by_kind_and_state(

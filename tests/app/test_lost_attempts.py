@@ -182,6 +182,48 @@ def test_a_job_has_all_of_its_progress_when_it_has_succeeded_and_not_before(
     assert [*seen, state_of(database, job.id).progress] == [99, 100]
 
 
+class Watch:
+    """A clock that stands still until it is set."""
+
+    now_s = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+
+def test_progress_is_written_at_once_and_then_no_more_than_twice_a_second(
+    database, settings, job, process, monkeypatch: pytest.MonkeyPatch
+):
+    watch = Watch()
+    monkeypatch.setattr("app.usecases.jobs.time", watch)
+    shown = []
+
+    def work_on(work: Work) -> None:
+        for later_s, percent in ((0.0, 10), (0.4, 20), (0.2, 30), (0.4, 40), (0.2, 50)):
+            watch.now_s += later_s
+            work.progress(percent / 100.0, f"{percent} %")
+            shown.append((state_of(database, job.id).progress, state_of(database, job.id).message))
+
+    process(work_on)
+    do_attempt(database, settings, job.id, job.attempt)
+    assert shown == [(n, f"{n} %") for n in (10, 10, 30, 30, 50)]
+
+
+@pytest.mark.parametrize(("done", "percent"), [(-0.5, 0), (0.0, 0), (0.429, 42), (0.999, 99), (7.0, 99)])
+def test_progress_is_in_whole_percent_that_are_done(
+    database, settings, job, process, done: float, percent: int
+):
+    seen = []
+
+    def work_on(work: Work) -> None:
+        work.progress(done, "on the way")
+        seen.append(state_of(database, job.id).progress)
+
+    process(work_on)
+    do_attempt(database, settings, job.id, job.attempt)
+    assert seen == [percent]
+
+
 def reserved_bytes(database: Database, job: Job) -> int:
     with database.transaction() as connection:
         row = run_sql(connection, "select results_bytes from job where id = %s", [job.id]).fetchone()
