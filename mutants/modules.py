@@ -77,7 +77,7 @@ MODULES = (
     _of_service(
         "points",
         "db/points.py db/point_detail.py db/history.py usecases/history.py usecases/features/points.py",
-        "unpublished points history chips",
+        "unpublished points history chips blocks",
     ),
     _of_service("uploads", "usecases/uploads.py db/uploads.py", "uploads upload_faults"),
     _of_service("storage", "storage", "storage storage_identity bucket"),

@@ -7,6 +7,7 @@ import pytest
 import rasterio
 from numpy.testing import assert_allclose, assert_array_equal
 
+from app.db import points as point_store
 from app.usecases.blocks import lifecycle
 from app.usecases.features import points
 from services.formats.chips import stacks
@@ -149,6 +150,35 @@ def test_more_points_than_are_sent_at_once_are_refused(get, monkeypatch):
         reply = get(CHIPS, **parameters)
         assert reply.status_code == 400
         assert "39" in reply.json()["detail"]
+
+
+def test_as_many_points_as_are_sent_at_once_are_sent(get, monkeypatch):
+    monkeypatch.setattr(points, "MOST_POINTS_WITH_CHIPS", 40)
+    ids = [FIRST + i for i in range(40)]
+    for parameters in ({"bbox": "5,43,6,44"}, {"ids": ",".join(map(str, [*ids, FIRST]))}):
+        assert_array_equal(np.unique(arrays(get(CHIPS, **parameters))["point_id"]), ids)
+
+
+def test_of_points_that_are_missing_the_first_ten_are_named(get):
+    for count, end in ((10, "10"), (11, "10 …")):
+        detail = get(CHIPS, ids=",".join(map(str, [FIRST, *range(1, count + 1)]))).json()["detail"]
+        assert detail.endswith(f"no point {', '.join(map(str, range(1, 10)))}, {end}")
+
+
+def test_the_directions_of_views_are_those_that_the_producer_states(made, get, connection):
+    """By the archive of chips, as a registration reads them, and of one point."""
+    row, views = 7, made.points.views
+    of_point = slice(int(views.start[row]), int(views.start[row + 1]))
+    stated = np.stack([views.incidence_deg[of_point], views.azimuth_deg[of_point]])
+    archive = arrays(get(CHIPS, ids=str(FIRST + row)))
+    stored = point_store.points_of_ids(connection, [FIRST + row, FIRST - 1]).points.views
+    one = get(f"/collections/points/items/{FIRST + row}").json()["properties"]["views"]
+    for found in (
+        [archive["incidence_deg"], archive["azimuth_deg"]],
+        [stored.incidence_deg, stored.azimuth_deg],
+        [[view["incidence_deg"] for view in one], [view["azimuth_deg"] for view in one]],
+    ):
+        assert_allclose(found, stated, rtol=in_single_precision)
 
 
 def test_chips_are_for_those_who_may_read_points(made, client):

@@ -19,10 +19,16 @@ from app.db.engine import Connection, Database
 from app.db.history import NOT_ATTRIBUTABLE
 from app.db.jobs import attempts, jobs
 from app.db.jobs.attempts import LostJob
-from app.errors import Conflict, InputError
+from app.errors import Conflict, InputError, NotFound
 from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block, publish_block
-from app.usecases.history import list_histories, record_measures, suspend_point
+from app.usecases.history import (
+    find_history,
+    list_histories,
+    record_measures,
+    reinstate_point,
+    suspend_point,
+)
 from app.usecases.registration.control_sources import points_of_block, points_of_store
 from app.usecases.registration.register import (
     ControlSources,
@@ -146,6 +152,133 @@ def test_every_point_and_view_that_was_tried_leaves_a_row(
     assert [row["view"] for row in rows] == views.view.tolist()
     assert [row["agreed"] for row in rows] == views.agreed.tolist()
     assert {row["registration_id"] for row in rows} == {rows[0]["registration_id"]}
+
+
+def test_each_figure_of_a_measure_is_kept_as_it_is(connection: Connection, stored: Registration) -> None:
+    """Figures that differ from each other everywhere, some of them unknown."""
+    rng = np.random.default_rng(4)
+    count, n_views = len(stored.measures.point_id), len(stored.views.point)
+    measures = replace(
+        stored.measures,
+        line_sample=rng.uniform(0.0, 4e4, (count, 2)),
+        sigma_px=rng.uniform(0.0, 1.0, count),
+        score=rng.uniform(0.0, 1.0, count),
+        residual_px=rng.normal(0.0, 1.0, (count, 2)),
+        residual_m=rng.normal(0.0, 1.0, (count, 2)),
+    )
+    for unknown in (measures.line_sample, measures.residual_px, measures.residual_m):
+        unknown[3] = np.nan
+    views = replace(stored.views, score=rng.uniform(0.0, 1.0, n_views))
+    remembered(connection, replace(stored, measures=measures, views=views), "a")
+    names = "line sample sigma_px score residual_line_px residual_sample_px"
+    columns = f"{names} residual_east_m residual_north_m".split()
+    rows = run_sql(connection, "select * from measure order by point_id").fetchall()
+    kept = np.array([[row[name] for name in columns] for row in rows], dtype=float)
+    given = (
+        *measures.line_sample.T,
+        measures.sigma_px,
+        measures.score,
+        *measures.residual_px.T,
+        *measures.residual_m.T,
+    )
+    np.testing.assert_allclose(kept, np.column_stack(given), rtol=1e-6)
+    rows = run_sql(connection, "select * from view_measure order by point_id, view").fetchall()
+    np.testing.assert_allclose([row["score"] for row in rows], views.score, rtol=1e-6)
+    assert [row["reason"] for row in rows] == views.reason.tolist()
+
+
+def test_what_a_history_states_of_a_point_is_the_mean_over_its_matches(
+    connection: Connection, stored: Registration
+) -> None:
+    rng, count = np.random.default_rng(5), len(stored.measures.point_id)
+    scenes = []
+    for scene in ("a", "b", "c"):
+        scenes.append(
+            replace(
+                stored.measures,
+                residual_px=rng.normal(2.0, 1.0, (count, 2)),
+                residual_m=rng.normal(2.0, 1.0, (count, 2)),
+                matched=stored.measures.active & (rng.uniform(size=count) < 0.7),
+            )
+        )
+        scenes[-1].residual_px[~scenes[-1].matched] = np.nan
+        scenes[-1].residual_m[~scenes[-1].matched] = np.nan
+        remembered(connection, replace(stored, measures=scenes[-1]), scene)
+    n_matched = sum(one.matched.astype(int) for one in scenes)
+    assert set(n_matched.tolist()) >= {0, 1, 2}
+    for row, point_id in enumerate(stored.measures.point_id.tolist()):
+        history_of_point = find_history(connection, point_id)
+        means = [
+            history_of_point.mean_residual_px,
+            history_of_point.mean_east_m,
+            history_of_point.mean_north_m,
+        ]
+        if not n_matched[row]:
+            assert means == [None, None, None]
+            continue
+        figures = [
+            [np.hypot(*one.residual_px[row]), *one.residual_m[row]] for one in scenes if one.matched[row]
+        ]
+        np.testing.assert_allclose(np.array(means, float), np.mean(figures, axis=0), rtol=1e-5)
+
+
+def tried(connection: Connection, point_id: int, attempts: int, successes: int, expected: float) -> None:
+    """Give a point these sums."""
+    run_sql(
+        connection,
+        "insert into point_history (point_id, attempts, successes, expected) values (%s, %s, %s, %s)",
+        [point_id, attempts, successes, expected],
+    )
+
+
+def test_a_point_is_proposed_after_six_failures_where_others_serve_or_twelve_where_half_do(
+    connection: Connection, first_id: int
+) -> None:
+    scenes = [(5, 1.0), (6, 1.0), (10, 0.5), (12, 0.5)]
+    for row, (failures, share) in enumerate(scenes):
+        tried(connection, first_id + row, failures, 0, failures * share)
+    states = [find_history(connection, first_id + row).state for row in range(len(scenes))]
+    assert states == ["served", "proposed", "served", "proposed"]
+    assert find_history(connection, first_id).health == pytest.approx(0.5)
+
+
+def test_the_worst_points_are_listed_first_and_of_equal_ones_those_tried_most(
+    connection: Connection, first_id: int
+) -> None:
+    rows = {0: (20, 9.0), 1: (9, 9.0), 2: (7, 7.0), 3: (20, 9.0), 4: (30, 20.0)}
+    for row, (failures, expected) in rows.items():
+        tried(connection, first_id + row, failures, 0, expected)
+    listed = [point.id - first_id for point in list_histories(connection, "proposed")]
+    assert listed == [4, 0, 3, 1, 2]
+    assert [point.id - first_id for point in list_histories(connection, "proposed", 2)] == listed[:2]
+
+
+def test_a_point_without_any_history_is_served_in_full_health(
+    connection: Connection, first_id: int
+) -> None:
+    untried = find_history(connection, first_id)
+    assert (untried.state, untried.health, untried.attempts) == ("served", 1.0, 0)
+    assert (untried.successes, untried.expected, untried.last_attempt) == (0, 0.0, None)
+
+
+@pytest.mark.parametrize("point_id", [1, -1, 2**63 - 1, 2**63, -(2**63) - 1, 10**30])
+def test_a_number_that_is_no_point_has_no_history(connection: Connection, point_id: int) -> None:
+    with pytest.raises(NotFound, match=f"no point {point_id}:"):
+        find_history(connection, point_id)
+
+
+def test_a_reinstated_point_has_no_reason_and_begins_again(
+    connection: Connection, first_id: int
+) -> None:
+    tried(connection, first_id, 9, 0, 9.0)
+    suspend_point(connection, first_id, "  a house was built  ")
+    suspended = find_history(connection, first_id)
+    assert (suspended.suspended_because, suspended.attempts) == ("a house was built", 9)
+    back = reinstate_point(connection, first_id)
+    assert (back.state, back.suspended_at, back.suspended_because) == ("served", None, None)
+    assert (back.attempts, back.health) == (0, 1.0)
+    with pytest.raises(Conflict, match="is not suspended"):
+        reinstate_point(connection, first_id)
 
 
 def test_the_history_of_a_point_is_the_sum_of_its_rows(

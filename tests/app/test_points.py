@@ -23,7 +23,7 @@ from app.db.points import POINTS
 from app.errors import InputError
 from app.usecases.blocks import lifecycle
 from app.usecases.features import points
-from app.usecases.features.items import everything_in
+from app.usecases.features.items import COLLECTIONS, everything_in
 from app.usecases.features.query import FeatureQuery, condition_of
 from services.geodesy import east_north_up
 from tests.factories import make_block
@@ -86,6 +86,39 @@ def test_pages_follow_each_other_without_gap_or_repetition(made, get):
         assert page["numberMatched"] == 60
     assert pages == 4
     assert seen == (2**26 + np.arange(60)).tolist()
+
+
+@pytest.mark.parametrize("limit", [1, 6, 7, 8, 16, 17])
+def test_pages_go_on_from_block_to_block_without_those_between(connection, storage, tmp_path, limit):
+    """Of blocks of seven, four, nine and three points the second and the last one are not published."""
+    expected, counts = [], {"a": 7, "b": 4, "c": 9, "d": 3}
+    for seed, (name, count) in enumerate(counts.items()):
+        folder = make_block(tmp_path / name, count=count, seed=seed, name=name).folder
+        number = lifecycle.ingest_block(connection, storage, folder).block.number
+        if name in "ac":
+            lifecycle.publish_block(connection, name)
+            expected += range(number << 26, (number << 26) + count)
+    selection, after, seen = everything_in(POINTS, None), None, []
+    while True:
+        page = features.page(connection, selection, "geojson", after, limit)
+        found = [feature["id"] for feature in json.loads(f"[{page.body.decode()}]")]
+        assert len(found) == page.returned <= limit
+        seen += found
+        after = page.last
+        if after is None:
+            break
+    assert seen == expected
+
+
+UNITS = {"m": "m", "px": "px", "deg": "deg", "km2": "km2"}
+
+
+@pytest.mark.parametrize("collection", ["points", "blocks", "density", "point-history"])
+def test_a_property_has_the_unit_that_its_name_ends_with_and_no_other(collection):
+    for name, item in COLLECTIONS[collection].queryables.items():
+        *_, last = name.split("_")
+        expected = f"1/{last}" if "_per_" in name else UNITS.get(last, "")
+        assert item.unit == expected, name
 
 
 def test_a_page_with_exactly_all_points_has_no_next(made, get):
