@@ -1,5 +1,6 @@
 """Abandoned uploads are deleted after a day of running time, even if clocks jump."""
 
+import logging
 import os
 import subprocess
 import sys
@@ -7,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from uuid import UUID, uuid4
 
@@ -16,9 +18,10 @@ import pytest
 from fastapi.testclient import TestClient
 
 from app.config import Settings
-from app.db import engine, scenes
+from app.db import blocks, engine, scenes, uptime
 from app.db.engine import Database
 from app.db.jobs import attempts, jobs
+from app.db.tokens import list_tokens
 from app.db.uploads import LIFE_HOURS
 from app.storage import Marker, Storage, read_marker, trash, write_marker
 from app.usecases import garbage_collection, storage_identity
@@ -31,7 +34,7 @@ from app.usecases.garbage_collection import (
 )
 from app.worker import sweep
 from app.worker.sweep import MOST_BETWEEN_S, Sweeper, sweep_files, sweep_records
-from tests.app.point_history import jump
+from tests.app.point_history import jump, let_pass
 from tests.statements import run_sql
 
 JOB_S = 3600.0
@@ -208,6 +211,59 @@ def test_unfinished_files_stay_as_long_as_an_upload_and_a_job_may_take(
     assert [path.name for path in storage.scratch().iterdir()] == ["24.5h"]
 
 
+def test_an_hour_or_nearly_two_between_sweeps_is_running_time_and_more_is_a_jump(database: Database):
+    """One sweep of files may have failed: that they come every hour is no promise."""
+
+    def counted_s(seconds: float) -> float:
+        with database.transaction() as connection:
+            run_sql(
+                connection,
+                "update uptime set elapsed_s = 0,"
+                " advanced_at = clock_timestamp() - make_interval(secs => %s)",
+                [seconds],
+            )
+            uptime.advance(connection, MOST_BETWEEN_S)
+            return uptime.today(connection)[1]
+
+    assert counted_s(3600.0) == pytest.approx(3600.0, abs=60.0)
+    assert counted_s(1.9 * 3600.0) == pytest.approx(1.9 * 3600.0, abs=60.0)
+    assert counted_s(3.0 * 3600.0) == counted_s(1000.0 * 3600.0) == pytest.approx(2.0 * 3600.0, abs=60.0)
+
+
+def test_a_scene_whose_image_stopped_arriving_is_given_up_after_a_day_unless_its_upload_goes_on(
+    client: TestClient, me: dict[str, str], database: Database, storage: Storage
+):
+    def uploading() -> set[str]:
+        listed = client.get("/scenes", headers=me).json()["scenes"]
+        return {one["id"] for one in listed if one["state"] == "uploading"}
+
+    with database.transaction() as connection:
+        owner = list_tokens(connection)[0].id
+        lost = str(scenes.begin_upload(connection, owner, "a.tif", "a.tif", sigma_m=None))
+    url = begun(client, me)
+    arriving = client.head(url, headers=me).headers["amers-scene"]
+    for hours, left in ((23, {lost, arriving}), (2, {arriving})):
+        assert client.patch(url, content=b"", headers=me | {"Upload-Offset": "10"}).is_success
+        with database.transaction() as connection:
+            let_pass(connection, hours)
+        sweep_files(database, storage, JOB_S)
+        assert uploading() == left, hours
+
+
+def test_files_of_the_attempt_that_counts_stay_however_deep_and_others_of_its_job_go(
+    database: Database, storage: Storage
+):
+    with database.transaction() as connection:
+        job = jobs.create(connection, "register-scene", {})
+        assert job is not None
+        assert attempts.claim_next(connection, "w", 30.0)
+    for name in ("1/report.json", "1/chips/0000.npy", "2/report.json", "11/report.json", "report.json"):
+        storage.put(f"results/{job.id}/{name}", [b"{}"])
+    sweep_files(database, storage, JOB_S)
+    kept = [f"results/{job.id}/1/{name}" for name in ("chips/0000.npy", "report.json")]
+    assert storage.keys("results") == kept
+
+
 def marked(storage: Storage, installation: UUID, generation: int) -> None:
     write_marker(storage, Marker(installation, generation))
 
@@ -291,6 +347,58 @@ def test_what_nobody_knows_goes_into_the_trash_from_every_folder(database: Datab
     assert storage.keys("scenes") + storage.keys("results") + storage.keys("uploads") == []
 
 
+def test_the_log_names_every_file_that_a_sweep_removes(
+    client: TestClient,
+    me: dict[str, str],
+    database: Database,
+    storage: Storage,
+    caplog: pytest.LogCaptureFixture,
+):
+    caplog.set_level(logging.INFO)
+    upload = begun(client, me).rsplit("/", 1)[1]
+    left = storage.scratch() / "left"
+    left.write_bytes(b"by a killed process")
+    os.utime(left, (time.time() - 1000 * 3600.0,) * 2)
+    removed = unknown_files(storage, 1) | {storage.put(f"chips/{'0' * 64}.npy", [b"x"]).key}
+    with database.transaction() as connection:
+        let_pass(connection, hours=LIFE_HOURS + 1)
+    caplog.clear()
+    sweep_files(database, storage, JOB_S)
+    lines = [line for line in caplog.messages if "which no row refers to" in line]
+    names = removed | {left.name, f"upload-{upload}"}
+    assert sorted(line.split()[3].rstrip(",") for line in lines) == sorted(names)
+    assert in_trash(storage) == removed
+    assert list(storage.scratch().iterdir()) == []
+
+
+@pytest.mark.parametrize(("trash_days", "n_in_trash"), [(0.0, 0), (7.0, 3)])
+def test_without_days_in_the_trash_files_are_deleted_at_once_even_by_a_sweep_that_breaks_off(
+    dsn: str,
+    database: Database,
+    storage: Storage,
+    monkeypatch: pytest.MonkeyPatch,
+    trash_days: float,
+    n_in_trash: int,
+):
+    """An ingestion keeps the sweep from the chips, and the disk may be full."""
+    monkeypatch.setattr(sweep, "LONGEST_WAIT_S", 0.1)
+    unknown_files(storage, 1)
+    with engine.connect(dsn) as ingesting:
+        blocks.lock_ingestion(ingesting)
+        with pytest.raises(psycopg.errors.LockNotAvailable):
+            sweep_files(database, storage, JOB_S, trash_days)
+    assert len(in_trash(storage)) == n_in_trash
+    assert storage.keys("scenes") + storage.keys("results") + storage.keys("uploads") == []
+
+
+def test_chips_that_no_block_has_are_removed_with_all_that_nobody_knows(
+    database: Database, storage: Storage
+):
+    unknown = unknown_files(storage, 1) | {storage.put(f"chips/{'0' * 64}.npy", [b"x"]).key}
+    assert set(remove_all_unnamed(database, storage)) == unknown
+    assert in_trash(storage) == unknown
+
+
 def test_an_operator_lets_more_files_go_at_once_than_a_sweep(
     database: Database, storage: Storage, monkeypatch: pytest.MonkeyPatch
 ):
@@ -318,7 +426,8 @@ class SimulatedStop(threading.Event):
         self.now_s, self.end_s = 0.0, 3600.0 * hours
 
     def monotonic(self) -> float:
-        return self.now_s
+        """Seconds by a clock that has run for long before the sweeper begins."""
+        return 1e6 + self.now_s
 
     def wait(self, timeout: float | None = None) -> bool:
         assert timeout is not None
@@ -354,3 +463,22 @@ def test_jobs_are_swept_thrice_a_lease_and_files_every_hour_after_a_quarter(
     assert swept["files"] == [4510.0, 8110.0], "not after records that could not be swept"
     assert len(swept["generation"]) == pytest.approx(180, abs=1)
     assert max(np.diff(swept["generation"])) <= 70.0
+
+
+def test_a_sweeper_keeps_to_the_settings_of_its_installation(
+    database: Database, storage: Storage, settings: Settings, monkeypatch: pytest.MonkeyPatch
+):
+    stop, given = SimulatedStop(hours=0.5), dict[str, tuple[object, ...]]()
+    own = {"lease_seconds": 31.0, "jobs_running_per_owner": 5, "job_seconds": 7.0, "trash_days": 0.5}
+    asked = settings.model_copy(update=own)
+    monkeypatch.setattr(sweep, "time", stop)
+    monkeypatch.setattr(storage_identity, "advance", lambda *_: None)
+    for what in ("jobs", "records", "files"):
+        note = partial(lambda what, *arguments: given.update({what: arguments}), what)
+        monkeypatch.setattr(sweep, f"sweep_{what}", note)
+    Sweeper(database, storage, asked, stop).run()
+    assert given == {
+        "jobs": (database, 31.0, 5),
+        "records": (database, storage, asked),
+        "files": (database, storage, 7.0, 0.5),
+    }
