@@ -10,6 +10,8 @@ import zipfile
 from base64 import b64encode
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
 from pathlib import Path
 from uuid import UUID, uuid4
 
@@ -29,10 +31,12 @@ from app.errors import Conflict, InputError, NotFound
 from app.main import create_app
 from app.storage import Storage
 from app.usecases.blocks.uploads import find_uploaded_block
+from app.usecases.scenes import SIDE_FILE_LIMIT_BYTES
 from app.usecases.uploads import UPLOAD_PREFIX, remove_abandoned_uploads
 from app.worker.sweep import sweep_files
 from tests.app.conftest import stored_files
 from tests.app.point_history import let_pass
+from tests.statements import run_sql
 
 TIFF = b"II*\0" + np.random.default_rng(1).bytes(300_000)
 LIMIT_BYTES = 400_000
@@ -387,6 +391,142 @@ def test_a_block_that_has_arrived_is_there_to_be_ingested(
         caller = list_tokens(connection)[0]
         key = find_uploaded_block(connection, caller, UUID(url.rsplit("/", 1)[-1]))
     assert storage.size(key) == 100
+
+
+@pytest.mark.parametrize("version", [None, "0.2.2", "1.0", ""])
+def test_a_request_without_the_version_of_the_protocol_is_refused_and_changes_nothing(
+    client: TestClient, me: dict[str, str], version: str | None
+):
+    url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
+    piece(client, url, me, 0, TIFF[:10])
+    other = {name: value for name, value in me.items() if name not in TUS}
+    other |= {} if version is None else {"Tus-Resumable": version}
+    for refused in (
+        begun(client, other, 10, filename="b.tif"),
+        client.head(url, headers=other),
+        piece(client, url, other, 10, TIFF[10:20]),
+        client.delete(url, headers=other),
+        client.post(url, headers=other | {"X-HTTP-Method-Override": "DELETE"}),
+    ):
+        assert (refused.status_code, refused.headers["tus-version"]) == (412, "1.0.0")
+        assert refused.headers["tus-resumable"] == "1.0.0"
+    assert client.get(url, headers=other).json()["offset"] == 10, "for clients without tus"
+    assert client.options("/uploads", headers=other).status_code == 204
+    assert len(client.get("/scenes", headers=other).json()["scenes"]) == 1
+
+
+def shown(client: TestClient, me: dict[str, str], reply: httpx.Response) -> dict[str, object]:
+    """The document of the upload that a reply has created."""
+    assert reply.status_code == 201, reply.text
+    document: dict[str, object] = client.get(reply.headers["location"], headers=me).json()
+    return document
+
+
+def test_a_purpose_may_be_named_or_follows_from_the_scene(client: TestClient, bearer: Bearer):
+    me = bearer("admin") | TUS
+    plain = begun(client, me, 10, filename="a.tif")
+    scene = plain.headers["amers-scene"]
+    assert shown(client, me, plain)["purpose"] == "image"
+    named = shown(client, me, begun(client, me, 10, filename="a.tif", purpose="image"))
+    assert (named["purpose"], named["scene"] == scene) == ("image", False)
+    for purpose in ({}, {"purpose": "model"}):
+        model = shown(client, me, begun(client, me, 10, filename="a.xml", scene=scene, **purpose))
+        assert (model["purpose"], model["scene"]) == ("model", scene)
+    for more in ({}, {"scene": scene}):
+        block = shown(client, me, begun(client, me, 10, filename="a.zip", purpose="block", **more))
+        assert (block["purpose"], block.get("scene")) == ("block", None)
+    beside = begun(client, me, 10, filename="b.tif", purpose="image", scene=scene)
+    assert (beside.status_code, "creates a new scene" in beside.json()["detail"]) == (422, True)
+
+
+@pytest.mark.parametrize("letters", [1, 195, 196, 197, 500])
+def test_of_a_long_name_the_last_two_hundred_letters_are_kept(
+    client: TestClient, me: dict[str, str], letters: int
+):
+    name = f"{'ab' * letters}"[:letters] + ".tif"
+    reply = begun(client, me, 10, filename=name)
+    assert shown(client, me, reply)["name"] == name[-200:]
+    scene = client.get(f"/scenes/{reply.headers['amers-scene']}", headers=me).json()
+    assert scene["name"] == name[-200:]
+
+
+def test_each_piece_gives_an_upload_another_day(
+    client: TestClient, me: dict[str, str], connection: Connection
+):
+    def hours_left(reply: httpx.Response) -> float:
+        expiry = parsedate_to_datetime(reply.headers["upload-expires"])
+        return (expiry - datetime.now(UTC)).total_seconds() / 3600.0
+
+    reply = begun(client, me, len(TIFF), filename="a.tif")
+    url = reply.headers["location"]
+    assert hours_left(reply) == pytest.approx(24.0, abs=0.1)
+    other = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
+    for data in (TIFF[:10], b""):
+        run_sql(connection, "update upload set expires_at = now() + interval '1 hour'")
+        connection.commit()
+        start = int(client.head(url, headers=me).headers["upload-offset"])
+        assert piece(client, url, me, start, data).status_code == 204
+        assert hours_left(client.head(url, headers=me)) == pytest.approx(24.0, abs=0.1)
+        assert hours_left(client.head(other, headers=me)) == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_largest_model_may_be_announced_and_the_largest_raster_as_an_image(
+    client: TestClient, me: dict[str, str]
+):
+    scene = begun(client, me, LIMIT_BYTES, filename="a.tif").headers["amers-scene"]
+    for name, most in (("a.xml", SIDE_FILE_LIMIT_BYTES), ("mask.tif", LIMIT_BYTES)):
+        for size, status in ((most, 201), (most + 1, 413)):
+            assert begun(client, me, size, filename=name, scene=scene).status_code == status, name
+
+
+def test_a_model_that_does_not_arrive_leaves_the_scene_and_its_former_model(
+    client: TestClient, me: dict[str, str], storage: Storage
+):
+    scene = whole(client, me, TIFF, filename="a.tif").headers["amers-scene"]
+    whole(client, me, b"former", filename="a_RPC.TXT", scene=scene)
+    ended = begun(client, me, 4, filename="a_RPC.TXT", scene=scene).headers["location"]
+    assert client.delete(ended, headers=me).status_code == 204
+    wrong = whole(client, me, b"<a/>", filename="a_RPC.TXT", scene=scene, sha256="0" * 64)
+    assert wrong.status_code == 422
+    document = client.get(f"/scenes/{scene}", headers=me).json()
+    assert (document["state"], document["models"]) == ("uploaded", ["a_RPC.TXT"])
+    assert storage.open(f"scenes/{scene}/a_RPC.TXT").read() == b"former"
+    assert list(storage.scratch().iterdir()) == []
+
+
+def test_the_model_that_an_administrator_sends_belongs_to_the_owner_of_the_scene(
+    client: TestClient, me: dict[str, str], bearer: Bearer
+):
+    scene = whole(client, me, TIFF, filename="a.tif").headers["amers-scene"]
+    admin, stranger = bearer("admin") | TUS, bearer("register") | TUS
+    assert begun(client, stranger, 4, filename="a.xml", scene=scene).status_code == 404
+    url = begun(client, admin, 4, filename="a.xml", scene=scene).headers["location"]
+    assert client.head(url, headers=stranger).status_code == 404
+    assert piece(client, url, me, 0, b"<a/>").status_code == 204
+    assert client.get(f"/scenes/{scene}", headers=me).json()["models"] == ["a.xml"]
+
+
+def test_an_upload_whose_bytes_are_on_another_machine_has_to_begin_again(
+    client: TestClient, me: dict[str, str], storage: Storage
+):
+    url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
+    (arriving,) = storage.scratch().iterdir()
+    arriving.unlink()
+    for reply in (client.get(url, headers=me), piece(client, url, me, 0, TIFF)):
+        assert reply.status_code == 404
+        assert "start a new upload" in reply.json()["detail"]
+
+
+@pytest.mark.parametrize("announced", [True, False])
+def test_the_checksum_of_a_block_is_kept_whether_it_was_announced_or_not(
+    client: TestClient, bearer: Bearer, connection: Connection, announced: bool
+):
+    data, admin = b"PK\3\4" * 10, bearer("admin") | TUS
+    sha256 = hashlib.sha256(data).hexdigest()
+    more = {"sha256": sha256} if announced else {}
+    assert whole(client, admin, data, filename="a.zip", purpose="block", **more).status_code == 204
+    row = run_sql(connection, "select sha256, size_bytes from upload").fetchone()
+    assert row == {"sha256": sha256, "size_bytes": len(data)}
 
 
 def test_a_complete_upload_is_not_ended_with_its_scene(
