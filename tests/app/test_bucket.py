@@ -1,18 +1,21 @@
 """The storage in a bucket behaves like the storage in a folder."""
 
 import hashlib
+import threading
 from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import obstore
 import pytest
 
 from app.config import Settings
-from app.errors import DamagedFile, InputError, NotFound, TooLarge
+from app.errors import DamagedFile, InputError, NotFound, StorageOutage, TooLarge
 from app.storage import Storage, StoredChips, bucket, chips_key, open_storage
 from services.conventions import CHIP_SIZE
-from tests.app.s3_server import running_bucket
+from tests.app.s3_server import KEYS, running_bucket
 
 SEVERAL_PARTS = 12_000_000
 """Size of a file that is sent in several parts."""
@@ -112,6 +115,71 @@ def test_a_file_of_the_scratch_folder_is_stored_and_stays_there(storage: Storage
     assert storage.size("scenes/c/a.tif") == 3
     assert unfinished(storage) == [path]
     path.unlink()
+
+
+def test_a_file_without_a_folder_is_copied_under_its_name(storage: Storage, tmp_path: Path):
+    storage.put("installation.json", [b"{}"])
+    path = storage.fetch("installation.json", tmp_path)
+    assert (path, path.read_bytes()) == (tmp_path / "installation.json", b"{}")
+
+
+def test_a_file_is_read_by_position_and_in_small_steps(storage: Storage):
+    data = bytes(range(200))
+    storage.put("scenes/steps", [data])
+    reader = storage.reader("scenes/steps")
+    for start, length in ((0, 1), (0, 200), (17, 1), (199, 1), (50, 100), (7, 0), (200, 0)):
+        assert reader.read(start, length) == data[start : start + length]
+    with storage.open("scenes/steps") as file:
+        assert [file.read(70) for _ in range(4)] == [data[:70], data[70:140], data[140:], b""]
+    with storage.open("scenes/steps") as file:
+        buffer = bytearray(150)
+        assert [file.readinto(buffer), file.readinto(buffer), file.readinto(buffer)] == [150, 50, 0]
+    assert storage.sizes("scenes")["scenes/steps"] == 200
+
+
+def test_a_storage_that_is_opened_twice_is_one(storage: Storage):
+    settings = Settings(data_folder=storage.folder.parent, storage_url=storage.place)
+    again, elsewhere = (
+        open_storage(settings),
+        open_storage(settings.model_copy(update={"storage_url": f"{storage.place}/other"})),
+    )
+    assert again == storage != elsewhere
+    assert len({storage, again, elsewhere}) == 2
+
+
+class Unwilling(BaseHTTPRequestHandler):
+    """A storage service that answers no request."""
+
+    asked: ClassVar[list[str]] = []
+
+    def do_HEAD(self) -> None:
+        """Refuse."""
+        self.asked.append(self.path)
+        self.send_response(503)
+        self.end_headers()
+
+    def log_message(self, *arguments: object) -> None:
+        """Keep quiet."""
+
+
+def test_a_request_that_fails_is_repeated_and_not_for_long(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    for name, value in KEYS.items():
+        monkeypatch.setenv(name, value)
+    with ThreadingHTTPServer(("127.0.0.1", 0), Unwilling) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.server_port}")
+            unwilling = open_storage(Settings(data_folder=tmp_path, storage_url="s3://bucket/test"))
+            with pytest.raises(StorageOutage, match="scenes/a: the storage does not answer"):
+                unwilling.size("scenes/a")
+        finally:
+            server.shutdown()
+            thread.join()
+    assert 3 <= len(Unwilling.asked) <= 5
+    assert set(Unwilling.asked) == {"/bucket/test/scenes/a"}
 
 
 def test_chips_are_read_from_a_bucket_by_ranges(storage: Storage, tmp_path: Path):

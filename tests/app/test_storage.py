@@ -14,11 +14,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xxhash
 from hypothesis import given
 from hypothesis import strategies as st
 
 from app.errors import DamagedFile, InputError, NotFound, TooLarge
 from app.storage import RangeReader, Storage, StoredChips, chips_key, trash
+from app.storage.content import read_content
 from app.storage.trash import Moment
 from app.usecases.garbage_collection import Bin, Family
 from services.conventions import CHIP_SIZE
@@ -163,6 +165,67 @@ def test_a_link_is_not_followed_out_of_the_folder(storage, tmp_path):
     assert storage.keys("scenes") == ["scenes/a"]
 
 
+def test_a_storage_may_lie_below_a_link(tmp_path):
+    """An operator mounts a disk somewhere and links to it: links inside alone are not followed."""
+    (tmp_path / "disk").mkdir()
+    os.symlink(tmp_path / "disk", tmp_path / "linked")
+    for folder in (tmp_path / "linked" / "storage", tmp_path / "linked"):
+        storage = Storage(folder)
+        storage.put("scenes/a", [b"x"])
+        assert storage.open("scenes/a").read() == b"x"
+        assert storage.keys("scenes") == ["scenes/a"]
+        storage.delete("scenes/a")
+        assert folder.exists()
+
+
+def test_nobody_else_on_the_machine_reads_what_is_stored(storage):
+    storage.put("results/a/1/report.json", [b"x"])
+    storage.put("results/a/1/model.txt", [b"y"])
+    scratch = storage.scratch() / "arrived"
+    scratch.touch(mode=0o600)
+    storage.link(scratch, "scenes/b/a.tif")
+    for key in ("results/a/1/report.json", "results/a/1/model.txt", "scenes/b/a.tif"):
+        path = storage.path(key)
+        assert [one.stat().st_mode & 0o077 for one in (path, path.parent, storage.scratch())] == [0] * 3
+
+
+def test_the_sizes_of_files_are_those_of_what_was_put(storage, tmp_path):
+    contents = {"scenes/a/x": b"one", "scenes/a/y/z": b"four", "scenes/b": b""}
+    for key, content in contents.items():
+        storage.put(key, [content])
+    os.symlink(storage.path("scenes/b"), storage.folder / "scenes" / "linked")
+    storage.put("results/a", [b"of another family"])
+    assert storage.sizes("scenes") == {key: len(content) for key, content in contents.items()}
+    assert storage.keys("scenes") == sorted(contents)
+    assert {storage.size(key) for key in contents} == {3, 4, 0}
+    assert (
+        storage.fetch("scenes/a/x", tmp_path)
+        == storage.path("scenes/a/x")
+        == storage.local("scenes/a/x")
+    )
+    assert storage.keys("none") == []
+
+
+def test_a_file_is_read_by_position_up_to_its_end(storage):
+    data = bytes(range(200))
+    storage.put("scenes/a", [data])
+    reader = storage.reader("scenes/a")
+    for start, length in ((0, 1), (0, 200), (17, 1), (199, 1), (50, 100), (7, 0)):
+        assert reader.read(start, length) == data[start : start + length]
+    assert reader.read(190, 100) == data[190:]
+    reader.close()
+
+
+def test_a_file_that_is_moved_replaces_what_has_its_new_key_and_leaves_no_empty_folders(storage):
+    storage.put("scenes/a/b/c", [b"moved"])
+    storage.put("scenes/d", [b"former"])
+    storage.move("scenes/a/b/c", "scenes/d")
+    storage.move("scenes/a/b/c", "scenes/d")
+    assert files(storage) == ["scenes/d"]
+    assert storage.open("scenes/d").read() == b"moved"
+    assert [path.name for path in (storage.folder / "scenes").iterdir()] == ["d"]
+
+
 def discarded(storage: Storage, content: bytes, at: Moment) -> None:
     storage.put("scenes/a", [content])
     trash.discard(storage, ["scenes/a"], at)
@@ -203,6 +266,22 @@ def test_the_trash_is_emptied_after_its_days_by_the_calendar_and_by_the_running_
     now = Moment(day + timedelta(days=days), 310 + hours)
     assert trash.delete_old(storage, now, 7.0) == deleted
     assert len(storage.keys("trash")) == 1 - deleted
+
+
+def test_of_the_trash_old_batches_go_with_all_of_their_files_and_folders_of_others_stay(storage):
+    day, hours = date(2026, 11, 22), 3100
+    for days, count in ((30, 2), (20, 1), (0, 4)):
+        at = Moment(day - timedelta(days=days), hours - 24 * days)
+        for number in range(count):
+            storage.put(f"scenes/{number}", [b"x"])
+        trash.discard(storage, [f"scenes/{number}" for number in range(count)], at)
+    storage.put("trash/of-an-operator/scenes/0", [b"x"])
+    storage.put("trash/2020-01-01_1h_copy/scenes/0", [b"x"])
+    assert trash.delete_old(storage, Moment(day, hours), 7.0) == 3
+    assert len(storage.keys("trash")) == 4 + 2
+    assert trash.delete_old(storage, Moment(day, hours), 7.0) == 0
+    assert trash.empty(storage) == 6
+    assert storage.keys("trash") == []
 
 
 @pytest.mark.parametrize(("n_files", "most"), [(120, 100), (2000, 100), (4000, 200)])
@@ -252,6 +331,66 @@ def test_rows_that_a_chip_file_does_not_have_are_refused(storage, stored_chips, 
     np.save(tmp_path / "0000.npy", numbered(9))
     with pytest.raises(DamagedFile, match="9 chips"):
         stored_chips.read(storage.put_chips(tmp_path / "0000.npy").key, row, count)
+
+
+def checked_chips(storage: Storage, chips: np.ndarray) -> tuple[StoredChips, str]:
+    """Stored chips with their checksums recorded, and the key of their file."""
+    content = npy(chips)
+    storage.put("chips/a.npy", [content])
+    read = read_content(io.BytesIO(content), lambda _: None, of_chips=True)
+    assert read.chip_checksums is not None
+    return StoredChips(storage, {"chips/a.npy": read.chip_checksums.tobytes()}.get), "chips/a.npy"
+
+
+@pytest.mark.parametrize("damaged", [[3], [0, 7, 19], list(range(10)), list(range(11))])
+def test_chips_that_are_not_what_they_were_are_named_the_first_ten_of_them(storage, damaged):
+    chips, key = checked_chips(storage, numbered(20))
+    changed = numbered(20)
+    changed[damaged, 50, 50] ^= 1
+    storage.put(key, [npy(changed)])
+    with pytest.raises(DamagedFile) as raised:
+        chips.read(key, 0, 20)
+    named = ", ".join(map(str, damaged[:10])) + (" …" if len(damaged) > 10 else "")
+    assert f": rows {named}. " in str(raised.value)
+    assert f"{len(damaged)} of its 20 chips" in str(raised.value)
+    whole = [row for row in range(20) if row not in damaged]
+    np.testing.assert_array_equal(chips.read(key, whole[-1], 1)[0], numbered(20)[whole[-1]])
+    storage.put(key, [npy(numbered(20))])
+    np.testing.assert_array_equal(chips.read(key, 0, 20), numbered(20), err_msg="it was repaired")
+    chips.close()
+
+
+@pytest.mark.parametrize("count", [19, 21])
+def test_a_file_with_more_or_fewer_chips_than_were_recorded_is_damaged(storage, count):
+    chips, key = checked_chips(storage, numbered(20))
+    storage.put(key, [npy(numbered(count))])
+    with pytest.raises(DamagedFile, match=f"{count} chips in its header, 20 recorded"):
+        chips.read(key, 0, 1)
+
+
+@pytest.mark.parametrize("count", [0, 1, 250])
+def test_what_is_read_of_a_chip_file_at_once_is_what_its_parts_have(count):
+    """Over a megabyte of chips comes in several pieces, whose borders lie within chips."""
+    chips = np.random.default_rng(3).integers(0, 4096, (count, CHIP_SIZE, CHIP_SIZE), dtype=np.uint16)
+    content, pieces = npy(chips), list[int]()
+    read = read_content(io.BytesIO(content), pieces.append, of_chips=True)
+    assert (read.size_bytes, sum(pieces)) == (len(content), len(content))
+    assert (len(pieces) > 1) == (len(content) > 1 << 20)
+    assert read.sha256 == hashlib.sha256(content).hexdigest()
+    assert read.chip_checksums is not None
+    expected = [xxhash.xxh3_64_intdigest(chip.tobytes()) % 2**32 for chip in chips]
+    assert read.chip_checksums.tolist() == expected
+
+
+@pytest.mark.parametrize("content", [b"", b"no chips", bytes(3 << 20)])
+def test_what_is_no_file_of_chips_has_no_checksums_of_them(content):
+    for of_chips in (True, False):
+        read = read_content(io.BytesIO(content), lambda _: None, of_chips=of_chips)
+        assert (read.size_bytes, read.chip_checksums) == (len(content), None)
+        assert read.sha256 == hashlib.sha256(content).hexdigest()
+    assert (
+        read_content(io.BytesIO(npy(numbered(2))), lambda _: None, of_chips=False).chip_checksums is None
+    )
 
 
 class WatchedStorage(Storage):
