@@ -204,6 +204,22 @@ def test_an_operation_without_a_declaration_is_noticed():
     assert operation.security is None
 
 
+OF_OPENAPI = {
+    *("tags", "summary", "description", "externalDocs", "operationId", "parameters", "requestBody"),
+    *("responses", "callbacks", "deprecated", "security", "servers"),
+}
+"""Members of an operation. Source: OpenAPI 3.1.0, section 4.8.10."""
+
+
+def test_what_the_description_adds_to_openapi_is_an_extension_that_names_scopes():
+    described = [item for path in DOCUMENT["paths"].values() for item in path.values()]
+    added = {member for item in described for member in item} - OF_OPENAPI
+    assert added
+    assert all(member.startswith("x-") for member in added)
+    further = {scope for item in OPERATIONS for scope in item.further}
+    assert {str(Scope.ADMIN)} <= further <= {str(scope) for scope in Scope}
+
+
 def test_public_settings_are_part_of_the_declaration():
     settings = Settings(data_folder=Path("unused"), public_points=True, public_metrics=True)
     public = {item.path for item in operations(create_app(settings).openapi()) if item.is_public}

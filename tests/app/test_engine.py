@@ -6,12 +6,13 @@ import psycopg
 import pytest
 from sqlalchemy import QueuePool, func, select, text
 
-from app.api.deps import UPLOADS_AT_ONCE, threads_for
+from app.api.deps import UPLOADS_AT_ONCE, threads_for, turns_for, upload_turns
 from app.config import Settings
 from app.db import engine
 from app.db.engine import Database
 from app.db.schema import block, token
 from app.usecases.tokens import create_token
+from tests.documents import ROOT
 from tests.statements import run_sql
 
 
@@ -46,6 +47,25 @@ def test_uploads_that_all_arrive_slowly_leave_a_thread_for_each_connection(
         assert all(isinstance(pool, QueuePool) for pool in pools)
         connections = sum(pool.size() for pool in pools)
     assert threads_for(sized) == UPLOADS_AT_ONCE + connections
+
+
+OPERATIONS = " ".join((ROOT / "docs" / "operations.md").read_text().split())
+
+
+@pytest.mark.parametrize("pool_size", [1, 2, 3, 4, 5, 7, 8, 9, 100])
+def test_requests_take_three_quarters_of_the_connections_and_one_caller_half(pool_size: int):
+    """As the manual says, in whole connections, and each caller has one at least."""
+    turns = turns_for(Settings(pool_size=pool_size))
+    assert 1 <= turns.most_per_caller <= turns.most <= pool_size
+    assert 0.0 <= turns.most - 0.75 * pool_size < 1.0
+    assert -1.0 < turns.most_per_caller - 0.5 * pool_size <= 0.5
+    assert f"waits for up to {turns.patience_s:g} s, and is then asked to retry" in OPERATIONS
+
+
+def test_uploads_have_the_turns_of_the_manual_and_do_not_wait_for_them():
+    turns = upload_turns()
+    assert f"{turns.most} in all and {turns.most_per_caller} for one caller" in OPERATIONS
+    assert turns.patience_s == 0.0
 
 
 def test_connections_that_died_in_the_pool_are_replaced_unseen(dsn: str, database: Database):

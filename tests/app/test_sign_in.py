@@ -94,6 +94,17 @@ def test_a_browser_signs_out(signed_in):
     assert signed_in.get(PAGE).status_code == 401
 
 
+def test_beside_a_token_in_the_header_a_session_neither_helps_nor_hinders(signed_in, bearer):
+    """A script of another site may send its own token, whatever cookies the browser adds."""
+    script = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "cors", "Sec-Fetch-Dest": "empty"}
+    assert signed_in.get(MINE, headers=script).status_code == 403
+    reply = signed_in.get(MINE, headers=script | bearer("read"))
+    assert (reply.status_code, reply.json()["name"]) == (200, "a token to read")
+    wrong = {"Authorization": "Bearer wrong"}
+    assert signed_in.get(MINE, headers=wrong).status_code == 401
+    assert signed_in.get(MINE, headers=script | wrong).status_code == 401
+
+
 def test_a_wrong_token_opens_no_session(client):
     for body in ("token=wrong", "token=%00%ff", "token=", "", "a=b"):
         headers = {"Content-Type": "application/x-www-form-urlencoded"}
