@@ -21,7 +21,7 @@ from app.errors import Conflict, InputError
 from app.usecases import history
 from app.usecases.blocks import lifecycle
 from app.usecases.blocks.listing import list_blocks
-from app.usecases.features.items import everything_in
+from app.usecases.features.items import COLLECTIONS, everything_in
 from app.usecases.features.points import points_of_filter
 from app.usecases.features.query import FeatureQuery
 from services.formats.block.document import AccuracyFigure
@@ -160,6 +160,88 @@ def test_points_of_a_cell_count_in_proportion_to_the_part_of_it_in_a_box(connect
     assert {number: points_in_box(connection, box) for number, box in boxes.items()} == {
         number: number for number in boxes
     }
+
+
+@pytest.mark.parametrize(
+    ("level", "width_deg", "south", "north"),
+    [
+        (0, 10.0, 39.0, 48.0),
+        (1, 20.0, 34.0, 53.0),
+        (2, 38.0, 23.0, 63.0),
+        (3, 100.0, 13.0, 73.0),
+        (4, 150.0, -40.0, 80.0),
+        (5, 174.0, -90.0, 90.0),
+    ],
+)
+def test_a_box_is_added_up_from_the_finest_cells_of_which_it_has_ten_thousand_at_most(
+    connection, ingest, level, width_deg, south, north
+):
+    """Its edge leaves a quarter of their cell of that level aside, and cuts no finer one."""
+    area_deg2, finest_deg = width_deg * (north - south), 0.1
+    assert area_deg2 <= 10_000 * (finest_deg * 2**level) ** 2
+    assert level == 0 or area_deg2 > 10_000 * (finest_deg * 2 ** (level - 1)) ** 2
+    # Columns count from 180 degrees west: 1855 is the last of its cell at every level.
+    east_deg = 1856 * finest_deg - 180.0
+    box = (east_deg - finest_deg, 43.2, east_deg, 43.3)
+    ingest("a", np.random.default_rng(2).uniform(box[:2], box[2:], (40, 2)), box=box)
+    lifecycle.publish_block(connection, "a")
+    west = east_deg - 0.75 * finest_deg * 2**level
+    assert points_in_box(connection, Box(west, south, west + width_deg, north)) == 30
+
+
+def test_points_on_both_sides_of_180_degrees_are_added_up_once(connection, ingest):
+    box = (179.9, -17.0, -179.9, -16.9)
+    ingest("a", np.array([[179.95, -16.95], [-179.95, -16.95], [-179.95, -16.96]]), box=box)
+    lifecycle.publish_block(connection, "a")
+    counted = {
+        Box(170.0, -20.0, -170.0, -10.0): 3,
+        Box(170.0, -20.0, 180.0, -10.0): 1,
+        Box(-180.0, -20.0, -170.0, -10.0): 2,
+        Box(-170.0, -20.0, 170.0, -10.0): 0,
+        # On both sides together too many cells of a tenth of a degree.
+        Box(175.0, -20.0, -175.0, 0.0): 3,
+    }
+    assert {one: points_in_box(connection, one) for one in counted} == counted
+
+
+def test_features_have_the_geometry_that_their_collection_declares_and_cells_a_tenth_of_a_degree(
+    connection, ingest, places
+):
+    ingest("a", places)
+    lifecycle.publish_block(connection, "a")
+    for name in ("points", "blocks", "density"):
+        collection = COLLECTIONS[name]
+        page = pages.page(connection, everything_in(collection, None), "geojson", None, 1000)
+        features = json.loads(f"[{page.body.decode()}]")
+        assert {one["geometry"]["type"] for one in features} == {collection.geometry_type}
+    ((ring,),) = ([np.array(ring) for ring in one["geometry"]["coordinates"]] for one in features)
+    np.testing.assert_allclose(np.ptp(ring, axis=0), 0.1)
+
+
+def test_of_points_that_are_equally_near_the_first_one_supersedes(connection, ingest, places):
+    """Wherever its row lies: the first point of the winner is written again behind the others."""
+    ingest("loser", places[:3])
+    winner = ingest("winner", np.repeat(places[:3], 3, axis=0), priority=1)
+    stored = points.points_of_block(connection, winner).points
+    first_id = {}
+    for point_id, (lon, lat, _) in zip(stored.id.tolist(), stored.lon_lat_h.tolist(), strict=True):
+        first_id.setdefault((lon, lat), point_id)
+    for statement in (
+        "create temp table moved on commit drop as select * from point where id = any(%s)",
+        "delete from point where id = any(%s)",
+        "insert into point select * from moved where id = any(%s)",
+    ):
+        run_sql(connection, statement, [[*first_id.values()]])
+    for name in ("loser", "winner"):
+        lifecycle.publish_block(connection, name)
+    superseded = run_sql(
+        connection,
+        "select st_x(geom) as lon, st_y(geom) as lat, superseded_by from point"
+        " where superseded_by is not null",
+    ).fetchall()
+    assert len(superseded) == 3
+    for row in superseded:
+        assert row["superseded_by"] == first_id[row["lon"], row["lat"]]
 
 
 def test_a_suspended_point_is_not_counted_as_served_until_it_is_reinstated(connection, ingest, places):
