@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 from app.config import Settings
-from app.db import engine, stored_files
+from app.db import engine, installation, stored_files
 from app.db.cluster import backup as archive
 from app.db.cluster.embedded import Cluster
 from app.errors import Conflict, InputError
-from app.storage import MARKER, Storage, open_storage, read_marker, trash
+from app.storage import MARKER, Marker, Storage, open_storage, read_marker, trash
 from app.usecases import storage_identity
 from app.usecases.backups import make
 from app.usecases.backups.make import make_backup
@@ -295,6 +295,23 @@ def test_a_restore_that_broke_off_mends_its_files_and_takes_no_other_database(
         storage.put(storage.keys("scenes")[0], [b"half of it"])
         restore_backup(dsn, storage, tmp_path / "backup")
         assert_whole(settings, placed(full))
+
+
+@pytest.mark.parametrize("kind", ["folder"])
+def test_a_restored_storage_names_the_installation_and_the_generation_of_its_backup(
+    full: Full, cluster: Cluster, tmp_path: Path
+):
+    """Before any service has looked at it: by then a later backup would not fit it any more."""
+    manifest = backed_up(full, tmp_path / "backup")
+    with fresh_database(cluster, EMPTY_TEMPLATE) as dsn:
+        storage = open_storage(empty(full, dsn, tmp_path / "restored"))
+        restore_backup(dsn, storage, tmp_path / "backup")
+        with engine.connect(dsn) as connection:
+            row = installation.read(connection)
+    marker = read_marker(storage)
+    assert marker == Marker(manifest.installation, manifest.generation)
+    assert (row.id, row.storage_generation) == (manifest.installation, manifest.generation)
+    assert manifest.generation > 0
 
 
 @pytest.mark.parametrize("kind", ["folder"])

@@ -22,7 +22,7 @@ from app.usecases.processes import Work
 from services.formats.block.check import check_block
 from services.formats.block.document import rectangle
 from services.formats.block.writer import write_block
-from services.types import point_chips
+from services.types import Frame, point_chips
 from tests.app.job_queue import claim, claimed, new_job
 from tests.factories import BOX, control_points, make_block, metadata, noise_chips
 from tests.statements import run_sql
@@ -171,6 +171,30 @@ def test_an_export_of_several_blocks_claims_what_all_of_them_do_and_nothing_else
     western = select_points(connection, ExportBlock((west, south, middle, north))).metadata
     assert (western.license, western.epoch) == ("CC-BY-4.0", 2020.0)
     assert western.accuracy == stated["a"].accuracy
+
+
+@pytest.mark.parametrize("axes", [(0, 1), (1, 0)])
+def test_the_frame_of_an_export_of_several_blocks_is_as_good_as_its_worse_horizontal_axis(
+    connection, storage, tmp_path, axes
+):
+    """Heights are another figure: they may be better or worse than both."""
+    west, south, east, north = BOX
+    middle = (west + east) / 2
+    variances = {"a": (1.0, 9.0, 100.0), "b": (4.0, 16.0, 0.01)}
+    for name, (first, last) in {"a": (west, middle), "b": (middle, east)}.items():
+        box = (first, south, last, north)
+        frame = Frame(np.diag([*np.array(variances[name])[[*axes]], variances[name][2]]))
+        contents = control_points(5, np.random.default_rng(7), box)
+        stated = replace(metadata(name, box=box), frame=frame)
+        write_block(tmp_path / name, stated, contents, noise_chips(contents), {})
+        lifecycle.ingest_block(connection, storage, tmp_path / name)
+        lifecycle.publish_block(connection, name)
+    whole = select_points(connection, ExportBlock(BOX)).metadata
+    (figure,) = whole.accuracy
+    own_m2 = np.diagonal(whole.frame.covariance_m2)
+    assert figure.value == pytest.approx(np.sqrt(own_m2[axes.index(1)]))
+    assert figure.value > np.sqrt(own_m2[axes.index(0)])
+    assert 3.0 < figure.value < 4.0, "between those of the blocks"
 
 
 def test_no_transaction_is_open_while_an_export_writes_files(
