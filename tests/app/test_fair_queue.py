@@ -198,6 +198,27 @@ def test_the_end_of_a_job_issues_no_ticket_that_nobody_needs(connection: Connect
     assert tickets(connection) == 2, "two jobs wait"
 
 
+def test_every_ticket_lies_in_the_queue_of_the_workers_under_the_name_of_their_task(
+    connection: Connection,
+):
+    for _ in range(3):
+        ask(connection, None)
+    back = claim(connection)
+    attempts.give_back(connection, back.id, back.attempt)
+    again = claim(connection)
+    attempts.try_again(connection, again.id, again.attempt, 3600.0)
+    last = claim(connection)
+    run_sql(connection, "delete from procrastinate_jobs where scheduled_at is null")
+    attempts.succeed(connection, last.id, last.attempt, {})
+    found = run_sql(
+        connection,
+        "select queue_name, task_name, status, scheduled_at is null as at_once"
+        " from procrastinate_jobs order by at_once",
+    ).fetchall()
+    named = {"queue_name": queue.QUEUE, "task_name": queue.TASK, "status": "todo"}
+    assert found == [{**named, "at_once": False}, {**named, "at_once": True}]
+
+
 def test_a_repeated_attempt_waits_for_its_delay(connection: Connection):
     delayed = ask(connection, None)
     job = claim(connection)

@@ -299,6 +299,7 @@ def test_the_error_of_a_job_names_files_and_no_folder_of_the_machine(tmp_path: P
 def test_the_title_of_an_error_is_its_name_in_words(tmp_path: Path, error: AmersError):
     details = error_details(error, Storage(tmp_path / "storage"))
     words = details["title"].split(" ")
+    assert details["type"] == "about:blank", "by RFC 9457 the title is then all that there is to know"
     assert "".join(words).lower() == details["error"].lower() == type(error).__name__.lower()
     assert len(words) == sum(letter.isupper() for letter in details["error"])
     assert [letter for letter in details["title"] if letter.isupper()] == [details["title"][0]]
@@ -346,6 +347,24 @@ def test_an_idempotency_key_has_one_to_two_hundred_characters(
     keyed = me | {"Idempotency-Key": "k" * length}
     reply = client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=keyed)
     assert reply.status_code == status
+
+
+def test_the_inputs_of_a_job_have_at_most_64_kib(
+    client: TestClient, me: dict[str, str], connection: Connection
+):
+    def ask(letters: int) -> tuple[int, int]:
+        """The status, and the size of the inputs as they are kept."""
+        inputs = {"bbox": [5.2, 43.2, 5.3, 43.3], "title": "x" * letters}
+        reply = client.post("/processes/export-block/execution", json={"inputs": inputs}, headers=me)
+        if not reply.is_success:
+            return reply.status_code, 0
+        job = jobs.find(connection, UUID(reply.json()["jobID"]))
+        assert job is not None
+        return reply.status_code, len(json.dumps(job.inputs))
+
+    status, size_of_one_letter = ask(1)
+    most = 1 + (64 << 10) - size_of_one_letter
+    assert (status, ask(most), ask(most + 1)) == (201, (201, 64 << 10), (422, 0))
 
 
 def test_a_job_names_all_of_its_scenes(client: TestClient, me: dict[str, str], scene: str):

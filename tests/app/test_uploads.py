@@ -35,6 +35,7 @@ from app.usecases.scenes import SIDE_FILE_LIMIT_BYTES
 from app.usecases.uploads import UPLOAD_PREFIX, remove_abandoned_uploads
 from app.worker.sweep import sweep_files
 from tests.app.conftest import stored_files
+from tests.app.ledger import bytes_in_ledger, bytes_in_storage, make_token
 from tests.app.point_history import let_pass
 from tests.statements import run_sql
 
@@ -297,6 +298,24 @@ def test_an_archive_with_an_image_and_its_model_becomes_a_scene(
     assert (scene["file"], scene["models"]) == ("IMG_1.TIF", ["RPC_1.XML"])
     assert scene["sha256"] == hashlib.sha256(TIFF).hexdigest()
     assert storage.keys("scenes") == [f"scenes/{scene['id']}/{n}" for n in ("IMG_1.TIF", "RPC_1.XML")]
+
+
+@pytest.mark.parametrize(("room", "status"), [(0, 204), (-1, 413)])
+def test_an_archive_needs_the_room_of_what_it_unpacks_to_and_no_more(
+    client: TestClient,
+    bearer: Bearer,
+    storage: Storage,
+    connection: Connection,
+    room: int,
+    status: int,
+):
+    """It is far smaller itself, and has files that nobody needs."""
+    files = {"a.tif": b"II*\0" + bytes(200_000), "a_RPC.TXT": bytes(3000), "READ.ME": bytes(100_000)}
+    needed = len(files["a.tif"]) + len(files["a_RPC.TXT"])
+    me = make_token(client, bearer("admin"), storage_quota_bytes=needed + room) | TUS
+    assert whole(client, me, zipped(files), filename="delivery.zip").status_code == status
+    stored = needed if status == 204 else 0
+    assert bytes_in_ledger(connection) == bytes_in_storage(storage) == stored
 
 
 @pytest.mark.parametrize(
