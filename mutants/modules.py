@@ -84,7 +84,7 @@ MODULES = (
     _of_service(
         "cleaning",
         "usecases/garbage_collection.py usecases/retention.py worker/sweep.py",
-        "sweep retention job_leases storage_identity",
+        "sweep retention job_leases storage_identity storage",
     ),
     _of_service("config", "config.py", "config"),
 )

@@ -105,6 +105,17 @@ def test_unfinished_files_are_swept_when_they_are_old_and_nobody_writes_them_or_
     assert files(storage) == ["scenes/a", "unfinished/upload-1"]
 
 
+def test_old_unfinished_files_are_swept_wherever_they_lie_between_young_ones(storage):
+    for number in range(20):
+        path = storage.scratch() / f"{number}"
+        path.write_bytes(b"x")
+        if number % 2:
+            os.utime(path, (path.stat().st_mtime - 7200.0,) * 2)
+    odd = [str(number) for number in range(1, 20, 2)]
+    assert sorted(storage.sweep_unfinished(3600.0, "upload-")) == sorted(odd)
+    assert {path.name for path in storage.scratch().iterdir()} == {str(n) for n in range(0, 20, 2)}
+
+
 def test_a_deleted_file_is_gone_with_its_empty_folders(storage):
     storage.put("scenes/a/b/c", [b"x"])
     storage.put("scenes/d", [b"x"])
@@ -282,6 +293,14 @@ def test_of_the_trash_old_batches_go_with_all_of_their_files_and_folders_of_othe
     assert trash.delete_old(storage, Moment(day, hours), 7.0) == 0
     assert trash.empty(storage) == 6
     assert storage.keys("trash") == []
+
+
+def test_a_batch_that_a_clock_gone_wrong_has_dated_keeps_no_other_one_in_the_trash(storage):
+    """The clock went back to 2020 for a while; what was discarded then is young by the running time."""
+    discarded(storage, b"old", Moment(date(2026, 1, 5), 1000))
+    discarded(storage, b"dated wrongly", Moment(date(2020, 1, 5), 1300))
+    assert trash.delete_old(storage, Moment(date(2026, 1, 20), 1310), 7.0) == 1
+    assert storage.keys("trash") == ["trash/2020-01-05_1300h/scenes/a"]
 
 
 @pytest.mark.parametrize(("n_files", "most"), [(120, 100), (2000, 100), (4000, 200)])
