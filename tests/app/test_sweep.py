@@ -25,6 +25,7 @@ from app.db.tokens import list_tokens
 from app.db.uploads import LIFE_HOURS
 from app.storage import Marker, Storage, read_marker, trash, write_marker
 from app.usecases import garbage_collection, storage_identity
+from app.usecases.blocks import lifecycle
 from app.usecases.garbage_collection import (
     FILES_AT_ONCE,
     Bin,
@@ -35,6 +36,7 @@ from app.usecases.garbage_collection import (
 from app.worker import sweep
 from app.worker.sweep import MOST_BETWEEN_S, Sweeper, sweep_files, sweep_records
 from tests.app.point_history import jump, let_pass
+from tests.factories import make_block
 from tests.statements import run_sql
 
 JOB_S = 3600.0
@@ -389,6 +391,23 @@ def test_without_days_in_the_trash_files_are_deleted_at_once_even_by_a_sweep_tha
             sweep_files(database, storage, JOB_S, trash_days)
     assert len(in_trash(storage)) == n_in_trash
     assert storage.keys("scenes") + storage.keys("results") + storage.keys("uploads") == []
+
+
+def test_chips_of_a_block_stay_whatever_its_state_and_others_go(
+    database: Database, storage: Storage, tmp_path: Path
+):
+    folder = make_block(tmp_path / "block", count=3, n_images=2).folder
+    with database.transaction() as connection:
+        lifecycle.ingest_block(connection, storage, folder)
+    kept, stray = storage.keys("chips"), f"chips/{'0' * 64}.npy"
+    assert kept
+    for step in (lifecycle.find_block, lifecycle.publish_block, lifecycle.withdraw_block):
+        with database.transaction() as connection:
+            step(connection, "calanques")
+        storage.put(stray, [b"x"])
+        sweep_files(database, storage, JOB_S)
+        assert storage.keys("chips") == kept
+    assert in_trash(storage) == {stray}
 
 
 def test_chips_that_no_block_has_are_removed_with_all_that_nobody_knows(
