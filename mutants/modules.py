@@ -72,12 +72,14 @@ MODULES = (
         "lost_attempts job_leases jobs job_progress fair_queue attempt_outcomes",
     ),
     _of_service(
-        "superseding", "db/superseding.py db/density.py", "superseding renewal_density feature_formats"
+        "superseding",
+        "db/superseding.py db/density.py",
+        "superseding renewal_density feature_formats reply_models",
     ),
     _of_service(
         "points",
         "db/points.py db/point_detail.py db/history.py usecases/history.py usecases/features/points.py",
-        "unpublished points history chips blocks",
+        "unpublished points history chips blocks reply_models",
     ),
     _of_service("uploads", "usecases/uploads.py db/uploads.py", "uploads upload_faults"),
     _of_service("storage", "storage", "storage storage_identity bucket"),

@@ -139,6 +139,16 @@ def test_malformed_credentials_are_refused_with_their_fault(
     assert len(sent) < 4 or sent not in reply.text + caplog.text
 
 
+def test_all_that_follows_the_first_colon_is_the_password(
+    client: TestClient, token: Callable[[str], str]
+):
+    """Source: RFC 7617, section 2: the name of a user has no colon, a password may."""
+    secret = token("read")
+    assert client.get("/tokens/self", headers=basic(secret)).status_code == 200
+    for password in (f"more:{secret}", f":{secret}", f"{secret}:more"):
+        assert client.get("/tokens/self", headers=basic(password)).status_code == 401
+
+
 def as_bytes(value: str | bytes) -> bytes:
     return value.encode() if isinstance(value, str) else value
 
@@ -241,7 +251,8 @@ def test_other_sites_may_link_to_a_page_and_show_nothing_of_it(
     me = basic(token("read")) | {"Sec-Fetch-Site": "cross-site"}
     items = "/collections/points/items?f=html"
     assert client.get(items, headers=me | LINK).status_code == 200
-    for embedded in (IMAGE, FRAME, {"Sec-Fetch-Mode": "cors", "Sec-Fetch-Dest": "empty"}):
+    neither = {"Sec-Fetch-Mode": "cors", "Sec-Fetch-Dest": "empty"}
+    for embedded in (IMAGE, FRAME, neither, LINK | {"Sec-Fetch-Mode": "no-cors"}):
         assert client.get(items, headers=me | embedded).status_code == 403, embedded
     # Without TLS a browser states no site.
     del me["Sec-Fetch-Site"]

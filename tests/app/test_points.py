@@ -19,8 +19,9 @@ from app.db.features import pages as features
 from app.db.features.collection import Viewer
 from app.db.features.counts import Count
 from app.db.features.query import Selection
-from app.db.points import POINTS
+from app.db.points import POINTS, points_of_block
 from app.errors import InputError
+from app.usecases import history
 from app.usecases.blocks import lifecycle
 from app.usecases.features import points
 from app.usecases.features.items import COLLECTIONS, everything_in
@@ -108,6 +109,24 @@ def test_pages_go_on_from_block_to_block_without_those_between(connection, stora
         if after is None:
             break
     assert seen == expected
+
+
+def test_the_points_of_a_block_are_its_own_in_any_state(connection, storage, tmp_path):
+    """Staged, published and withdrawn; a suspended point is one of them."""
+    counts = {"a": 7, "b": 4, "c": 9}
+    numbers = {}
+    for seed, (name, count) in enumerate(counts.items()):
+        folder = make_block(tmp_path / name, count=count, seed=seed, name=name).folder
+        numbers[name] = lifecycle.ingest_block(connection, storage, folder).block.number
+    history.suspend_point(connection, (numbers["b"] << 26) + 2, "a house was built")
+    for name in counts:
+        for step in (lifecycle.find_block, lifecycle.publish_block, lifecycle.withdraw_block):
+            step(connection, name)
+            for other, count in counts.items():
+                stored = points_of_block(connection, numbers[other])
+                first = numbers[other] << 26
+                assert stored.points.id.tolist() == list(range(first, first + count))
+                assert [block.id for block in stored.blocks] == [other]
 
 
 UNITS = {"m": "m", "px": "px", "deg": "deg", "km2": "km2"}
