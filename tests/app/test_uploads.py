@@ -24,6 +24,7 @@ from tusclient.client import TusClient
 
 from app.config import Settings
 from app.db import engine
+from app.db import uploads as upload_rows
 from app.db.engine import Connection
 from app.db.tokens import list_tokens
 from app.db.uploads import LIFE_HOURS
@@ -601,6 +602,23 @@ def test_a_block_is_ingested_from_a_complete_archive_of_ones_own(
     for caller in callers.values():
         with pytest.raises(InputError, match="purpose image"):
             find_uploaded_block(connection, caller, id_of(image))
+
+
+def test_the_archive_of_a_block_is_found_by_its_upload_and_no_other_file_is(
+    client: TestClient, bearer: Bearer, connection: Connection, storage: Storage
+):
+    admin = bearer("admin") | TUS
+    ids = {}
+    for purpose, name in (("block", "a.zip"), ("image", "a.tif"), ("block", "b.zip")):
+        reply = begun(client, admin, len(TIFF), filename=name, purpose=purpose)
+        url = reply.headers["location"]
+        assert piece(client, url, admin, 0, TIFF).status_code == 204
+        ids[name] = UUID(url.rsplit("/", 1)[-1])
+    found = {name: upload_rows.find_block(connection, upload_id) for name, upload_id in ids.items()}
+    keys = {name: f"uploads/{ids[name]}/{name}" for name in ("a.zip", "b.zip")}
+    assert found == {**keys, "a.tif": None}
+    assert storage.keys("uploads") == sorted(keys.values())
+    assert upload_rows.find_block(connection, uuid4()) is None
 
 
 def test_what_a_complete_upload_has_left_beside_its_file_is_removed(
