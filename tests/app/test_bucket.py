@@ -132,6 +132,8 @@ def test_a_file_is_read_by_position_and_in_small_steps(storage: Storage):
     with storage.open("scenes/steps") as file:
         assert [file.read(70) for _ in range(4)] == [data[:70], data[70:140], data[140:], b""]
     with storage.open("scenes/steps") as file:
+        assert [file.read(70), file.read(), file.read()] == [data[:70], data[70:], b""]
+    with storage.open("scenes/steps") as file:
         buffer = bytearray(150)
         assert [file.readinto(buffer), file.readinto(buffer), file.readinto(buffer)] == [150, 50, 0]
     assert storage.sizes("scenes")["scenes/steps"] == 200

@@ -253,6 +253,19 @@ def test_the_worst_points_are_listed_first_and_of_equal_ones_those_tried_most(
     assert [point.id - first_id for point in list_histories(connection, "proposed", 2)] == listed[:2]
 
 
+def test_each_point_that_was_tried_is_listed_in_one_state(connection: Connection, first_id: int) -> None:
+    for row, expected in enumerate((3.0, 9.0, 2.0, 12.0)):
+        tried(connection, first_id + row, 12, 0, expected)
+    suspend_point(connection, first_id + 3, "a house was built")
+
+    def listed(state: str) -> list[int]:
+        points = list_histories(connection, state)
+        assert {point.state for point in points} == {state}
+        return [point.id - first_id for point in points]
+
+    assert [listed(state) for state in history.STATES] == [[0, 2], [1], [3]]
+
+
 def test_a_point_without_any_history_is_served_in_full_health(
     connection: Connection, first_id: int
 ) -> None:
