@@ -1,6 +1,7 @@
 """The storage in a bucket behaves like the storage in a folder."""
 
 import hashlib
+import io
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -134,6 +135,7 @@ def test_a_file_is_read_by_position_and_in_small_steps(storage: Storage):
     with storage.open("scenes/steps") as file:
         assert [file.read(70), file.read(), file.read()] == [data[:70], data[70:], b""]
     with storage.open("scenes/steps") as file:
+        assert isinstance(file, io.BufferedReader)
         buffer = bytearray(150)
         assert [file.readinto(buffer), file.readinto(buffer), file.readinto(buffer)] == [150, 50, 0]
     assert storage.sizes("scenes")["scenes/steps"] == 200

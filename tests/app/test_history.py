@@ -204,7 +204,7 @@ def test_what_a_history_states_of_a_point_is_the_mean_over_its_matches(
         scenes[-1].residual_px[~scenes[-1].matched] = np.nan
         scenes[-1].residual_m[~scenes[-1].matched] = np.nan
         remembered(connection, replace(stored, measures=scenes[-1]), scene)
-    n_matched = sum(one.matched.astype(int) for one in scenes)
+    n_matched = np.sum([one.matched for one in scenes], axis=0)
     assert set(n_matched.tolist()) >= {0, 1, 2}
     for row, point_id in enumerate(stored.measures.point_id.tolist()):
         history_of_point = find_history(connection, point_id)

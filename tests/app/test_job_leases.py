@@ -187,13 +187,18 @@ def test_a_job_that_outlives_too_many_workers_fails(database: Database):
     assert f"died {FAILURES_ALLOWED} times" in failed.error["detail"]
 
 
+def lost_once(database: Database, job: Job) -> None:
+    """The job loses its worker."""
+    let_lease_lapse(database, job.id)
+    sweep_jobs(database, LEASE_S)
+
+
 def lost_for_good(database: Database, job: Job) -> None:
     """The job loses as many workers as it may."""
     for attempt in range(1, FAILURES_ALLOWED + 1):
         if attempt > 1:
             claimed(database, job.id)
-        let_lease_lapse(database, job.id)
-        sweep_jobs(database, LEASE_S)
+        lost_once(database, job)
 
 
 ENDS: dict[str, Callable[[Database, Job], object]] = {
@@ -205,10 +210,7 @@ ENDS: dict[str, Callable[[Database, Job], object]] = {
 RETURNS: dict[str, Callable[[Database, Job], object]] = {
     "given back": in_transaction(lambda c, job: attempts.give_back(c, job.id, job.attempt)),
     "tried again": in_transaction(lambda c, job: attempts.try_again(c, job.id, job.attempt, 0.0)),
-    "loses a worker": lambda database, job: (
-        let_lease_lapse(database, job.id),
-        sweep_jobs(database, LEASE_S),
-    ),
+    "loses a worker": lost_once,
 }
 
 

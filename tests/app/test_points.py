@@ -92,7 +92,7 @@ def test_pages_follow_each_other_without_gap_or_repetition(made, get):
 @pytest.mark.parametrize("limit", [1, 6, 7, 8, 16, 17])
 def test_pages_go_on_from_block_to_block_without_those_between(connection, storage, tmp_path, limit):
     """Of blocks of seven, four, nine and three points the second and the last one are not published."""
-    expected, counts = [], {"a": 7, "b": 4, "c": 9, "d": 3}
+    expected, counts = list[int](), {"a": 7, "b": 4, "c": 9, "d": 3}
     for seed, (name, count) in enumerate(counts.items()):
         folder = make_block(tmp_path / name, count=count, seed=seed, name=name).folder
         number = lifecycle.ingest_block(connection, storage, folder).block.number

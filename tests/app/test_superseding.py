@@ -224,7 +224,7 @@ def test_of_points_that_are_equally_near_the_first_one_supersedes(connection, in
     ingest("loser", places[:3])
     winner = ingest("winner", np.repeat(places[:3], 3, axis=0), priority=1)
     stored = points.points_of_block(connection, winner).points
-    first_id = {}
+    first_id = dict[tuple[float, float], int]()
     for point_id, (lon, lat, _) in zip(stored.id.tolist(), stored.lon_lat_h.tolist(), strict=True):
         first_id.setdefault((lon, lat), point_id)
     for statement in (
