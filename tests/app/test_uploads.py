@@ -442,21 +442,38 @@ def shown(client: TestClient, me: dict[str, str], reply: httpx.Response) -> dict
     return document
 
 
-def test_a_purpose_may_be_named_or_follows_from_the_scene(client: TestClient, bearer: Bearer):
-    me = bearer("admin") | TUS
-    plain = begun(client, me, 10, filename="a.tif")
-    scene = plain.headers["amers-scene"]
-    assert shown(client, me, plain)["purpose"] == "image"
-    named = shown(client, me, begun(client, me, 10, filename="a.tif", purpose="image"))
-    assert (named["purpose"], named["scene"] == scene) == ("image", False)
-    for purpose in ({}, {"purpose": "model"}):
-        model = shown(client, me, begun(client, me, 10, filename="a.xml", scene=scene, **purpose))
-        assert (model["purpose"], model["scene"]) == ("model", scene)
-    for more in ({}, {"scene": scene}):
-        block = shown(client, me, begun(client, me, 10, filename="a.zip", purpose="block", **more))
-        assert (block["purpose"], block.get("scene")) == ("block", None)
-    beside = begun(client, me, 10, filename="b.tif", purpose="image", scene=scene)
+@pytest.fixture
+def arriving(client: TestClient, me: dict[str, str]) -> str:
+    """The id of a scene whose image arrives."""
+    return str(begun(client, me, 10, filename="a.tif").headers["amers-scene"])
+
+
+@pytest.mark.parametrize("named", [{}, {"purpose": "model"}])
+def test_a_file_that_names_a_scene_is_a_model_of_it(
+    client: TestClient, me: dict[str, str], arriving: str, named: dict[str, str]
+):
+    model = shown(client, me, begun(client, me, 10, filename="a.xml", scene=arriving, **named))
+    assert (model["purpose"], model["scene"]) == ("model", arriving)
+
+
+@pytest.mark.parametrize("named", [{}, {"purpose": "image"}])
+def test_a_file_that_names_no_scene_is_the_image_of_another_one(
+    client: TestClient, me: dict[str, str], arriving: str, named: dict[str, str]
+):
+    image = shown(client, me, begun(client, me, 10, filename="a.tif", **named))
+    assert (image["purpose"], image["scene"] == arriving) == ("image", False)
+
+
+def test_an_image_does_not_join_a_scene(client: TestClient, me: dict[str, str], arriving: str):
+    beside = begun(client, me, 10, filename="b.tif", purpose="image", scene=arriving)
     assert (beside.status_code, "creates a new scene" in beside.json()["detail"]) == (422, True)
+
+
+@pytest.mark.parametrize("named", [{}, {"scene": str(UUID(int=1))}])
+def test_a_block_belongs_to_no_scene(client: TestClient, bearer: Bearer, named: dict[str, str]):
+    me = bearer("admin") | TUS
+    block = shown(client, me, begun(client, me, 10, filename="a.zip", purpose="block", **named))
+    assert (block["purpose"], block.get("scene")) == ("block", None)
 
 
 @pytest.mark.parametrize("letters", [1, 195, 196, 197, 500])
