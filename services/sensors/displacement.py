@@ -124,6 +124,7 @@ def _bilinear(line: Array, sample: Array, values: Array, line_sample: Array) -> 
 @njit(cache=True)
 def _cell(nodes: Array, position: float) -> tuple[int, float]:
     """Node before a position, and the share of the way to the next, 0 to 1."""
-    before = min(max(np.searchsorted(nodes, position, side="right") - 1, 0), len(nodes) - 2)
-    share = (position - nodes[before]) / (nodes[before + 1] - nodes[before])
+    behind = int(np.searchsorted(nodes, position, side="right"))
+    before = min(max(behind - 1, 0), len(nodes) - 2)
+    share = float((position - nodes[before]) / (nodes[before + 1] - nodes[before]))
     return before, min(max(share, 0.0), 1.0)
