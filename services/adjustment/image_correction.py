@@ -232,22 +232,21 @@ def adjust_scene(
     if ground and (usable & ~ground.measures).sum() >= min_points:
         return _beside(ground, again, model, observations)
     components = motion.components
-    shared_fit, of_shared = declared, agreeing
     if components:
         active = measured.agreeing(fit, seen if like is None else usable, components, expected, limit)
         active &= _in_held_parts(observations, active)
-        followed = solve_displacement(measured.residuals(fit, active), components, expected, shape)
-        shared_fit, of_shared = measured.without(followed.displacement, declared), active
     shared = (
         like.shared
         if like
-        else likeliest_shared_errors(
-            shared_fit,
-            of_shared,
-            free,
-            slope_px,
-            position=measured.position,
-            overlapping=measured.overlapping,
+        else _shared_errors(
+            measured,
+            fit,
+            components,
+            declared=declared,
+            active=active,
+            agreeing=agreeing,
+            free=free,
+            slope_px=slope_px,
         )
     )
     agreeing_measures = AgreeingMeasures(measured, fit, declared, active, shared, limit)
@@ -324,6 +323,29 @@ def _motion(
         active=active,
         breaks=breaks,
         tolerance=options.tolerance,
+    )
+
+
+def _shared_errors(
+    measured: PlacedMeasures,
+    fit: AffineFit,
+    components: tuple[Component, ...],
+    *,
+    declared: AffineFit,
+    active: BoolArray,
+    agreeing: BoolArray,
+    free: BoolArray,
+    slope_px: float,
+) -> SharedErrors:
+    """The errors that neighbours share, of what the components leave."""
+    left, of_left = declared, agreeing
+    if components:
+        residuals, expected = measured.residuals(fit, active), fit.expected(slope_px)
+        followed = solve_displacement(residuals, components, expected, measured.shape)
+        left, of_left = measured.without(followed.displacement, declared), active
+    position, overlapping = measured.position, measured.overlapping
+    return likeliest_shared_errors(
+        left, of_left, free, slope_px, position=position, overlapping=overlapping
     )
 
 
