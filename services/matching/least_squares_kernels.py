@@ -48,7 +48,7 @@ def fit_position(
     row, col = start
     r, c = row, col
     for _ in range(MAX_STEPS):
-        if r < 0.0 or c < 0.0 or r > lines - side - 2.0 or c > samples - side - 2.0:
+        if r < 0.0 or c < 0.0 or r > lines - side - 3.0 or c > samples - side - 3.0:
             return failed
         _interpolated(coefficients, r + 1.0, c + 1.0, at, 0)
         _centre(at, used)
@@ -66,7 +66,7 @@ def fit_position(
             return failed
         if size < STEP_PX:
             break
-    if r < 0.0 or c < 0.0 or r > lines - side - 2.0 or c > samples - side - 2.0:
+    if r < 0.0 or c < 0.0 or r > lines - side - 3.0 or c > samples - side - 3.0:
         return failed
     _interpolated(coefficients, r + 1.0, c + 1.0, at, 0)
     _centre(at, used)

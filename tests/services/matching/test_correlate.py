@@ -178,18 +178,6 @@ def test_a_chip_beyond_the_search_radius_has_a_border_peak(shift: tuple[float, f
     assert find_chip(patch_of(moved(ground, *shift)), chip_of(ground), OPTIONS).reason == "border_peak"
 
 
-@pytest.mark.parametrize("distance_px", [5.1, 5.3])
-@pytest.mark.parametrize("towards", [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
-def test_a_chip_just_within_the_search_radius_is_found_on_each_side(
-    towards: tuple[float, float], distance_px: float
-) -> None:
-    shift = distance_px * np.array(towards)
-    ground = texture(np.random.default_rng(0), PERIOD, 2.0)
-    peak = find_chip(patch_of(moved(ground, *shift)), chip_of(ground), OPTIONS)
-    assert peak.reason == FOUND
-    np.testing.assert_allclose(np.abs(peak.row_col), np.abs(shift), atol=a_twentieth_of_a_pixel)
-
-
 def test_a_repeated_pattern_is_ambiguous() -> None:
     rng = np.random.default_rng(0)
     side = SIDE + 40
