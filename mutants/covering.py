@@ -111,6 +111,8 @@ def _defined(statement: ast.stmt) -> str:
     if isinstance(statement, ast.FunctionDef | ast.ClassDef):
         return statement.name
     targets = statement.targets if isinstance(statement, ast.Assign) else []
+    if isinstance(statement, ast.AnnAssign):
+        targets = [statement.target]
     return next((target.id for target in targets if isinstance(target, ast.Name)), "")
 
 
