@@ -5,11 +5,9 @@ import numpy as np
 from services.imagery.scene import Scene
 from services.matching.height_consensus import view_consensus
 from services.registration.context import SearchStage
-from services.registration.search import FIRST_TOLERANCE_PX, next_step
+from services.registration.search import FIRST_TOLERANCE_PX, next_step, sees_nothing
 from services.types import Array
 
-_NOTHING = 0.1
-"""Share of the points tried that random pixels show at most."""
 _MAX_FALSE_ALARMS = 1e-4
 _MORE = 1.25
 """Points that agree on another view, over those that agree on one displacement, at least."""
@@ -29,11 +27,8 @@ def another_view(
     Returns:
         A sentence for the refusal; "" where there is nothing to tell.
     """
-    if stage.matched <= _NOTHING * stage.tried:
-        return (
-            "next to none of the points is seen: the image may be that of another scene than its model; "
-            + next_step(stage, scene.sigma_m)
-        )
+    if sees_nothing(stage):
+        return next_step(stage, scene.sigma_m)
     derivative = scene.model.project_derivative(lon_lat_h.mean(axis=0)[None, :])[0, :, :2]
     px_per_m = float(np.sqrt(abs(np.linalg.det(derivative))))
     agrees, false_alarms = view_consensus(

@@ -31,6 +31,8 @@ from services.types import Array, BoolArray, ControlPoints, IntArray
 
 FIRST_TOLERANCE_PX = 3.0
 """Displacements of a first search agree within this many pixels of the chips that are searched."""
+_NOTHING = 0.1
+"""Share of the points tried that random pixels show at most."""
 MOST_CANDIDATES = 3
 """Number of groups of matches that a summary shows."""
 MOST_CANDIDATE_POINTS = 20
@@ -379,13 +381,28 @@ def larger_sigma_m(stage: SearchStage | None, sigma_m: float) -> float:
     return float(f"{2.0 * (reach_m if reach_m > 2.0 * sigma_m else sigma_m):.2g}")
 
 
+def sees_nothing(stage: SearchStage) -> bool:
+    """Whether a search found no more of its points than random pixels show."""
+    return stage.matched <= _NOTHING * stage.tried
+
+
 def next_step(stage: SearchStage, sigma_m: float) -> str:
-    """What to try after a search that was refused, with the option written out.
+    """What to think of and to try after a search that was refused, with the option written out.
 
     Args:
         stage: summary of the search.
         sigma_m: stated accuracy of the scene, which set the radius of the first search.
     """
+    if not sees_nothing(stage):
+        return _to_try(stage, sigma_m)
+    return (
+        "next to none of the points is seen: the image may be that of another scene than its model; "
+        + _to_try(stage, sigma_m)
+    )
+
+
+def _to_try(stage: SearchStage, sigma_m: float) -> str:
+    """What to try after a search that was refused; see `next_step`."""
     option = f"--sigma-m {larger_sigma_m(stage, sigma_m):g}"
     if stage.limited:
         smaller_m = float(f"{stage.search_radius_m / MAX_ERROR_SIGMAS:.2g}")

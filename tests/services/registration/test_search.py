@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.errors import NoConsensus
+from services.errors import NoConsensus, NotEnoughPoints
 from services.geodesy import ecef_from_east_north_up, ecef_from_lon_lat_h
 from services.imagery.scene import Scene
 from services.imagery.source import ArrayImage
@@ -13,7 +13,13 @@ from services.map_grid import MapGrid
 from services.matching.consensus import Consensus, Voters
 from services.matching.control_points import PointMatches
 from services.registration.context import SearchStage
-from services.registration.search import check_consensus, first_consensus, predict, summarise
+from services.registration.search import (
+    check_consensus,
+    check_inliers,
+    first_consensus,
+    predict,
+    summarise,
+)
 from services.sensors.base import SensorModel
 from services.sensors.ortho import OrthoModel
 from services.simulation.orbit import pushbroom_over
@@ -245,3 +251,15 @@ def test_a_point_still_to_be_found_may_be_as_far_off_as_the_points_found() -> No
     expected_m2 = 4.0 * first_m**2 - 3.0 * (rms_px * FLAT_GSD_M) ** 2
     found_m2 = predict(scene, points, vague).uncertainty_m ** 2
     np.testing.assert_allclose(found_m2, expected_m2, rtol=0.01)
+
+
+@pytest.mark.parametrize(("matched", "named"), [(0, True), (3, True), (5, True), (7, False)])
+def test_a_search_that_sees_next_to_nothing_may_be_of_another_scene(matched: int, named: bool) -> None:
+    """A first search that is precise enough to begin with the finest chips says so, too."""
+    of = stage(name="fine", tried=60, matched=matched, at_border=0, inliers=0)
+    scene = replace(wide_scene(0.0, 5.0), sigma_m=100.0)
+    reason = np.array(["low_score"] * (60 - matched))
+    with pytest.raises(NotEnoughPoints) as refused:
+        check_inliers(of, 2.0, reason, scene, 8)
+    assert ("may be that of another scene than its model" in str(refused.value)) == named
+    assert "--sigma-m 200" in str(refused.value)
