@@ -63,7 +63,7 @@ _NODES = 30
 """Places along each side of the image at which the nearest point is sought."""
 _MOST_WITH_SLOPE = 0.6
 """Percent of a distance by which a correction may grow up the slope of the ground. Attitudes and orbits
-drift by less than a tenth of that; campaigns draw up to a tenth more, at random directions."""
+drift by less than a tenth of that; campaigns draw up to half as much again, in any direction."""
 _ALONG_SLOPE = 1.5
 """Growth of a correction up the slope over that across it, from which on heights explain it; a rotation
 or a scale has 1."""
