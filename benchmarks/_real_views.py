@@ -82,6 +82,15 @@ class RealView:
     noise_px: float
 
 
+def is_kept_apart(name: str) -> bool:
+    """Whether the points of a view are made without it; those of a pair were measured in it as well."""
+    return len(PLACES[_place_of(name)].files) > 2
+
+
+def _place_of(name: str) -> str:
+    return name.rsplit("_", 1)[0]
+
+
 @lru_cache(maxsize=1)
 def real_view(real_data: Path, name: str) -> RealView:
     """A view by its name; one is kept at a time.
@@ -89,8 +98,7 @@ def real_view(real_data: Path, name: str) -> RealView:
     Two views of three give the points for the third. Of a pair both give them, with the chips of the
     other one alone: no pixel of the scene is matched with itself.
     """
-    place_name, number = name.rsplit("_", 1)
-    place, shown = PLACES[place_name], int(number) - 1
+    place, shown = PLACES[_place_of(name)], int(name.rsplit("_", 1)[1]) - 1
     scenes = [_in_memory(read_scene(real_data / place.folder / file)) for file in place.files]
     others = [k for k in range(len(scenes)) if k != shown]
     sources = others if len(others) > 1 else [0, 1]
