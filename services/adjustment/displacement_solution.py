@@ -62,27 +62,42 @@ def agreeing_with(
         expected: (2, k) a priori weights of the parameters.
         tolerance: standard deviations.
     """
-    full = with_components(residuals, components)
+    full = with_components(residuals.regular, components)
     kept = np.arange(len(residuals.misfit))
+    projection = _projection(full, expected)
     while len(kept) > residuals.design.shape[1] + 2:
-        magnitude = np.zeros(len(kept))
-        for k in range(2):
-            inverse = np.linalg.inv(full.covariance[k][np.ix_(kept, kept)])
-            design = full.design[kept]
-            weighted = inverse @ design
-            normal = design.T @ weighted + np.diag(expected[k])
-            projection = inverse - weighted @ np.linalg.pinv(normal, hermitian=True) @ weighted.T
-            precision = np.maximum(np.diagonal(projection), 1e-12)
-            left_out = (projection @ full.misfit[kept, k]) / np.sqrt(precision)
-            magnitude = np.maximum(magnitude, np.abs(left_out))
+        precision = np.maximum(np.diagonal(projection, axis1=1, axis2=2), 1e-12)
+        rest = (projection @ full.misfit[kept].T[:, :, None])[..., 0]
+        magnitude = np.abs(rest / np.sqrt(precision)).max(axis=0)
         worst = float(magnitude.max())
         if worst <= tolerance * max(float(np.median(magnitude)) / _MEDIAN_OF_LARGER, 1e-9):
             break
         # The worst spoils what is predicted of its neighbours; others as bad are wrong by themselves.
-        kept = kept[magnitude < _AS_BAD * worst]
+        stays = magnitude < _AS_BAD * worst
+        kept, projection = kept[stays], _projection_without(projection, ~stays)
     agrees = np.zeros(len(residuals.misfit), dtype=bool)
     agrees[kept] = True
     return agrees
+
+
+def _projection(full: Residuals, expected: Array) -> Array:
+    """Weights (2, n, n) of measures in each coordinate, less what the parameters take up.
+
+    Times the measures, over the roots of its diagonal, they are what the others leave, in sigmas.
+    """
+    inverse = np.linalg.inv(full.covariance)
+    weighted = inverse @ full.design
+    normal = full.design.T @ weighted + expected[:, :, None] * np.eye(expected.shape[1])
+    inverse -= weighted @ np.linalg.pinv(normal, hermitian=True) @ np.swapaxes(weighted, 1, 2)
+    return np.asarray(inverse)
+
+
+def _projection_without(projection: Array, dropped: BoolArray) -> Array:
+    """That of the measures that stay, by the Schur complement of those that are dropped."""
+    rows = projection[:, ~dropped]
+    among = np.linalg.pinv(projection[:, dropped][:, :, dropped], hermitian=True)
+    across = rows[:, :, dropped]
+    return np.asarray(rows[:, :, ~dropped] - across @ among @ np.swapaxes(across, 1, 2))
 
 
 def solve_displacement(

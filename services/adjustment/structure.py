@@ -98,12 +98,20 @@ class Residuals:
     design: Array
     chip_side_px: float
 
+    @property
+    def regular(self) -> "Residuals":
+        """The same residuals, each with a little noise of its own.
+
+        Chips that are the same have the same errors: no covariance of them can be inverted.
+        """
+        least = 1e-9 * np.diagonal(self.covariance, 0, 1, 2).max(axis=1)
+        noise = least[:, None, None] * np.eye(len(self.misfit))
+        return replace(self, covariance=self.covariance + noise)
+
     @cached_property
     def whitened(self) -> tuple[Array, Array, Array]:
         """Cholesky factors (2, n, n), bases (2, n, k) of the design, what it leaves (2, n)."""
-        # Chips that are the same have the same errors: no covariance of them can be inverted.
-        least = 1e-9 * np.diagonal(self.covariance, 0, 1, 2).max(axis=1)
-        lower = np.linalg.cholesky(self.covariance + least[:, None, None] * np.eye(len(self.misfit)))
+        lower = np.linalg.cholesky(self.regular.covariance)
         bases, left = [], []
         for k in range(2):
             columns = np.column_stack([self.design, self.misfit[:, k]])

@@ -273,3 +273,19 @@ def test_what_measures_state_scales_the_accuracy_of_a_motion_and_leaves_the_moti
         stated.displacement.at(places), as_shown.displacement.at(places), atol=1e-6
     )
     assert stated.sigma0 == pytest.approx(as_shown.sigma0 / times, rel=1e-6)
+
+
+def test_measures_given_twice_are_judged_as_if_given_once() -> None:
+    """Two chips that are the same share all their errors, so their covariance cannot be inverted."""
+    residuals, wrong = some_wrong(5)
+    given = np.concatenate([np.arange(len(wrong)), np.flatnonzero(~wrong)[:6]])
+    twice = replace(
+        residuals,
+        line_sample=residuals.line_sample[given],
+        height_m=residuals.height_m[given],
+        misfit=residuals.misfit[given],
+        covariance=residuals.covariance[:, given[:, None], given],
+        design=residuals.design[given],
+    )
+    agrees = agreeing_with(twice, (SMOOTH,), np.zeros((2, 3)), 4.0)
+    np.testing.assert_array_equal(agrees, ~wrong[given])
