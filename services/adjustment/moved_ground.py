@@ -164,21 +164,30 @@ def moved_ground(
     # Points may be worse than stated.
     unit = max(1.0, explained.scale(_column(moved))) ** 2
     explained = replace(explained, fit=fit.scaled(unit))
-    bands = np.array(list(_bands(fit.t)))
-    bands = bands[_on_both_sides(bands, seen)]
-    gain, _ = rows.gains(bands[:, seen, None].astype(np.float64))
-    others = [
-        explained.by_motion(tuple(one.scaled(unit) for one in motion.components), motion.agreeing),
-        explained.by_shared_errors(clipped.scaled(unit)),
-        explained.by(_surface(measured, fit.t)),
-        *(explained.by(_column(band)) for band in bands[np.argsort(-gain)[:_LOOKED_AT]]),
-    ]
-    evidence = explained.by(_column(moved)) - np.log(len(_ELLIPSES)) - max(others)
-    if evidence < _LEAST_EVIDENCE:
-        return None
+    told = explained.by(_column(moved)) - float(np.log(len(_ELLIPSES)))
+    evidence = np.inf
+    for likelihood in _by_all_else(explained, rows, clipped.scaled(unit), motion.scaled(unit)):
+        evidence = min(evidence, told - likelihood)
+        if evidence < _LEAST_EVIDENCE:
+            return None
     if _inside(ellipse, _NODES).mean() > 0.5:
         moved = ~moved
-    return MovedGround(seen & moved, float(evidence))
+    return MovedGround(seen & moved, evidence)
+
+
+def _by_all_else(
+    explained: _Explained, rows: Residuals, clipped: AffineFit, motion: SceneMotion
+) -> Iterator[float]:
+    """How likely all else that displaces neighbours together makes the measures, one after another."""
+    t, seen = explained.fit.t, explained.seen
+    yield explained.by_motion(motion.components, motion.agreeing)
+    yield explained.by_shared_errors(clipped)
+    yield explained.by(_surface(explained.measured, t))
+    bands = np.array(list(_bands(t)))
+    bands = bands[_on_both_sides(bands, seen)]
+    gain, _ = rows.gains(bands[:, seen, None].astype(np.float64))
+    for band in bands[np.argsort(-gain)[:_LOOKED_AT]]:
+        yield explained.by(_column(band))
 
 
 def _likeliest_ellipse(explained: _Explained, rows: Residuals) -> Array:

@@ -31,6 +31,10 @@ class SceneMotion:
     along_axes: tuple[Structure, ...]
     agreeing: BoolArray
 
+    def scaled(self, factor: float) -> "SceneMotion":
+        """The same motion with the variances of its components multiplied by a factor."""
+        return replace(self, components=tuple(one.scaled(factor) for one in self.components))
+
 
 def what_moves(
     measured: PlacedMeasures,
