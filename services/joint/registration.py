@@ -33,6 +33,7 @@ from services.registration.elsewhere import adjust_with_places
 from services.registration.on_points import Registration, search_near, search_scene
 from services.registration.options import RegistrationOptions
 from services.registration.point_selection import initial_prediction, points_to_try, visible_points
+from services.registration.search import adjust_search
 from services.sensors.correction import CorrectedModel, no_correction
 from services.sensors.pushbroom import PushbroomModel
 from services.tasks import Work
@@ -185,8 +186,8 @@ def measure_scene(
     options = options_in_block(scene, options)
     stages: list[SearchStage] = []
     try:
-        context, search, _ = search_scene(scene, points, chips, options, stages=stages)
-        search, alone, elsewhere = adjust_with_places(context, search)
+        context, search, alone = search_scene(scene, points, chips, options, stages=stages)
+        search, alone, elsewhere = adjust_with_places(context, search, alone)
     except CoverageError:
         return nothing_found(scene, points.take(np.zeros(0, dtype=np.int64)))
     except ComputationError:
@@ -241,7 +242,8 @@ def _searched_again(
         search, _ = search_near(context, prediction, rows)
         alone, elsewhere = None, None
         with suppress(ComputationError):
-            search, alone, elsewhere = adjust_with_places(context, search)
+            alone = adjust_search(scene, search, context.options.adjustment, ground_may_move=True)
+            search, alone, elsewhere = adjust_with_places(context, search, alone)
         again[measured.name] = MeasuredScene(
             scene, shown, search, alone, tuple(context.stages), elsewhere
         )

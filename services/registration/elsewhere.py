@@ -51,19 +51,19 @@ class _Again:
 
 
 def adjust_with_places(
-    context: PointContext, search: Search
+    context: PointContext, search: Search, adjustment: SceneAdjustment
 ) -> tuple[Search, SceneAdjustment, Elsewhere | None]:
-    """The adjustment on the last search, and the points that agree on another place of the scene.
+    """The points that agree on another place of the scene, and the adjustment beside them.
 
     Args:
         context: of the registration.
         search: the last one.
+        adjustment: on it.
 
     Returns:
         The search, with the points of both places where ground has moved; the adjustment on it; the
         points that agree elsewhere, None without any.
     """
-    adjustment = adjust_search(context.scene, search, context.options.adjustment, ground_may_move=True)
     prediction = predict(context.scene, context.points, adjustment)
     elsewhere = _search_elsewhere(context, prediction, search, adjustment)
     if elsewhere and elsewhere.slope_px is None and not adjustment.moved:

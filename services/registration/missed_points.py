@@ -45,7 +45,7 @@ def search_missed_points(
         farther = _found_farther(context, prediction, search, np.flatnonzero(missed & unfound))
         if farther is None:
             continue
-        again = adjust_search(context.scene, farther, context.options.adjustment)
+        again = adjust_search(context.scene, farther, context.options.adjustment, ground_may_move=True)
         if axis == 0 or again.active.sum() > adjustment.active.sum():
             return farther, again
     return search, adjustment

@@ -106,7 +106,7 @@ def register_scene(
         TurnedImage: they agree on an image that is turned.
     """
     try:
-        context, search, _ = search_scene(
+        context, search, adjustment = search_scene(
             scene, points, chips, options, progress=progress, stages=stages
         )
     except (NoConsensus, NotEnoughPoints) as error:
@@ -114,7 +114,7 @@ def register_scene(
         if not turned:
             raise
         raise TurnedImage(f"the image is {turned} ({error})") from error
-    search, adjustment, elsewhere = adjust_with_places(context, search)
+    search, adjustment, elsewhere = adjust_with_places(context, search, adjustment)
     return build_registration(context, context.points, search, adjustment, elsewhere)
 
 
@@ -161,10 +161,11 @@ def search_scene(
     if needs_coarse_search(context, prediction):
         prediction = search_coarsely(context.part(0.0, 0.3), prediction)
     context = replace(context, breaks=scene_breaks(scene))
-    for part in context.parts(0.3, 0.6, options.fine_stages):
+    for stage, part in enumerate(context.parts(0.3, 0.6, options.fine_stages), start=1):
         rows = points_to_try(scene, points, prediction, options.max_points)
         search = _match(part, prediction, rows)
-        adjustment = adjust_search(scene, search, options.adjustment)
+        last = stage == options.fine_stages
+        adjustment = adjust_search(scene, search, options.adjustment, ground_may_move=last)
         prediction = predict(scene, points, adjustment)
     return context, *search_missed_points(context, prediction, search, adjustment)
 

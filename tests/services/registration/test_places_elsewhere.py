@@ -14,7 +14,7 @@ from services.quality.lack_of_fit import Elsewhere
 from services.registration.context import PointContext
 from services.registration.elsewhere import adjust_with_places
 from services.registration.options import RegistrationOptions
-from services.registration.search import Search, select_inliers
+from services.registration.search import Search, adjust_search, select_inliers
 from services.types import Acquisition, Array, BoolArray, ViewMeasures, no_progress
 from tests.factories import control_points
 from tests.services.conftest import GSD_M, SHAPE, FlatModel
@@ -26,6 +26,13 @@ NOISE_PX = 0.2
 EVENLY = np.sqrt(3.0)
 """Even errors have this as the largest, standard deviations: none is taken for wrong."""
 BEYOND_PX = np.array([6.0, 2.0])
+
+
+def elsewhere_of(context: PointContext, search: Search) -> Elsewhere | None:
+    """The points of a search that agree on another place of the scene."""
+    options = context.options.adjustment
+    adjustment = adjust_search(context.scene, search, options, ground_may_move=True)
+    return adjust_with_places(context, search, adjustment)[2]
 
 
 def named(off_px: Array, place: Array, height_m: Array | None = None) -> Elsewhere | None:
@@ -61,7 +68,7 @@ def named(off_px: Array, place: Array, height_m: Array | None = None) -> Elsewhe
     )
     inliers = found & (np.hypot(*(off_px - np.nanmedian(off_px, axis=0)).T) < 3.0)
     search = Search(points, np.arange(n), matches, inliers, 50.0)
-    return adjust_with_places(context, search)[2]
+    return elsewhere_of(context, search)
 
 
 def places(beside: int) -> tuple[Array, BoolArray]:
@@ -154,7 +161,7 @@ def test_lines_that_lie_far_from_the_others_are_found_in_a_wide_window() -> None
     matches = match_points(narrow, points, chips, context.options.matching)
     inliers, _ = select_inliers(broken.model, points, matches)
     search = Search(points, np.arange(64), matches, inliers, CHIP_SIZE * GRID_M)
-    elsewhere = adjust_with_places(context, search)[2]
+    elsewhere = elsewhere_of(context, search)
     assert elsewhere is not None
     beside = points.lon_lat_h[elsewhere.rows]
     line = broken.model.project(beside)[:, 0]
