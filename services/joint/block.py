@@ -29,6 +29,8 @@ from services.types import (
 
 _FREE_SLOPE_PX = 1000.0
 """A priori standard deviation of drift and skew where their order is given."""
+_ALIKE = 4
+"""Nodes of a displacement, on each side of a place, over which it errs alike: half of its length."""
 _GRID = 5
 """Places a side of an image at which covariances are compared."""
 
@@ -110,11 +112,13 @@ def adjust_together(
         ComputationError: the observations do not allow a solution.
     """
     known = [neighbour.displacement(one.name) if neighbour else None for one in scenes]
-    moved = [one.displacement or before for one, before in zip(scenes, known, strict=True)]
-    images = tuple(_image(*one, options) for one in zip(scenes, moved, strict=True))
+    images = tuple(
+        _image(one, one.displacement or before, options)
+        for one, before in zip(scenes, known, strict=True)
+    )
     rows = [np.flatnonzero(measured.usable) for measured in scenes]
     shared = np.array([_shared_factor(one, _correction(one, None, options)) for one in scenes])
-    ties = _with_displacements(moved, ties)
+    ties = _with_displacements([image.displacement for image in images], ties)
     block = _adjusted(scenes, images, shared, ties, neighbour, rows=rows)
     if not len(ties):
         return block
@@ -209,13 +213,30 @@ def _correction(
 def _with_displacements(
     displacements: Sequence[DisplacementGrid | None], ties: Observations
 ) -> Observations:
-    """Tie points, as uncertain as the displacements of their scenes make them."""
+    """Tie points, as uncertain as the displacements of their scenes make them.
+
+    Tie points on the same lines share the error of the displacement: together they tell no more than one
+    of them.
+    """
     variance_px2 = ties.sigma_px**2
     for number, displacement in enumerate(displacements):
         if displacement is not None:
             own = ties.image == number
-            variance_px2[own] += displacement.variance_at(ties.line_sample[own]).mean(axis=1)
+            place = ties.line_sample[own]
+            error_px2 = displacement.variance_at(place).mean(axis=1)
+            variance_px2[own] += error_px2 * _sharing(displacement, place)
     return replace(ties, sigma_px=np.sqrt(variance_px2))
+
+
+def _sharing(displacement: DisplacementGrid, place: Array) -> Array:
+    """How many of positions (n, 2) lie so near to each that a displacement errs alike there."""
+    count = np.ones(len(place))
+    for at, nodes in zip(place.T, (displacement.line, displacement.sample), strict=True):
+        if len(nodes) > 2:
+            ordered, reach = np.sort(at), _ALIKE * (nodes[-1] - nodes[0]) / (len(nodes) - 1)
+            near = np.searchsorted(ordered, at + reach) - np.searchsorted(ordered, at - reach)
+            count = np.maximum(count, near)
+    return count
 
 
 def _control(

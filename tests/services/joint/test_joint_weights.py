@@ -58,6 +58,33 @@ def test_ties_of_a_scene_are_as_uncertain_as_what_moves_its_lines() -> None:
     assert sigma_px[2] == pytest.approx(sigma_px[1])
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_ties_where_a_motion_is_unknown_tell_no_more_together_than_one_of_them(axis: int) -> None:
+    """A displacement that is uncertain by 5 px on the last quarter of the lines, or of the samples.
+
+    It errs alike over eight of its nodes: on sixteen of them all ties tell as much as two.
+    """
+    scenes, ties = list(scenes_and_ties()[0]), scenes_and_ties()[1]
+    nodes, ends = np.linspace(0.0, SHAPE[axis] - 1.0, 65), np.array([0.0, SHAPE[axis] - 1.0])
+    unknown = np.where(nodes > 0.75 * SHAPE[axis], 25.0, 0.0)
+    variance_px2 = np.tile(unknown[:, None, None], (1, 2, 2))
+    line, sample = nodes, ends
+    if axis == 1:
+        line, sample, variance_px2 = ends, nodes, variance_px2.transpose(1, 0, 2)
+    grid = DisplacementGrid(line, sample, np.zeros_like(variance_px2), variance_px2)
+    alone = scenes[0].alone
+    assert alone is not None
+    moved = replace(alone, correction=replace(alone.correction, displacement=grid))
+    scenes[0] = replace(scenes[0], alone=moved)
+    block = adjust_together(scenes, ties, OPTIONS)
+    of_scene = block.of_ties(0)
+    sigma_px, at = block.ties.sigma_px[of_scene], block.ties.line_sample[of_scene, axis]
+    there = at > 0.75 * SHAPE[axis] + np.diff(nodes)[0]
+    assert there.sum() > 30
+    assert 1.0 < 25.0 * (sigma_px[there] ** -2.0).sum() < 4.0
+    np.testing.assert_allclose(sigma_px[at < 0.74 * SHAPE[axis]], TIE_NOISE_PX, rtol=0.25)
+
+
 def test_control_of_four_times_the_variance_places_a_scene_as_much_worse() -> None:
     """What neighbouring points share does not average out: fewer of them are independent."""
     measured = scenes_and_ties()[0][0]
