@@ -86,7 +86,10 @@ class SceneTruth:
 
     def position(self, lon_lat_h: Array) -> Array:
         """Where the image truly shows ground points (n, 3)."""
-        position = self.error.apply(self.geometry.rpc.project(lon_lat_h))
+        return self.moved(self.error.apply(self.geometry.rpc.project(lon_lat_h)))
+
+    def moved(self, position: Array) -> Array:
+        """Positions (n, 2) of an image that swings and is bent as planned."""
         along_lines = np.sin(2.0 * np.pi * position[:, :1] / self.shape[0])
         diagonal = np.sin(2.0 * np.pi * position.sum(axis=1, keepdims=True) / sum(self.shape))
         swing_px, bend_px = np.array(self.plan.swing_px), np.array(self.plan.bend_px)
@@ -213,7 +216,7 @@ def measured_scene(
     )
     search = Search(points, np.arange(n), matches, found, 0.0)
     enough = found.sum() >= options.adjustment.min_points
-    alone = adjust_search(scene, search, options_in_block(scene, options).adjustment) if enough else None
+    alone = adjust_search(scene, search, options_in_block(options).adjustment) if enough else None
     return MeasuredScene(scene, points, search, alone)
 
 

@@ -7,6 +7,9 @@ import numpy as np
 
 from services.adjustment.parameters import Computed, FreeParameter
 from services.errors import InputError
+from services.sensors.correction import ImageCorrection
+from services.sensors.displacement import DisplacementGrid
+from services.sensors.moving_pushbroom import moving_model
 from services.sensors.parameter_sets import UNITS, ParameterSet
 from services.sensors.pushbroom import PushbroomModel
 from services.sensors.pushbroom_errors import TERMS, PushbroomErrors
@@ -27,22 +30,21 @@ class RigorousParameters:
 
     Attributes:
         name: of the image, for messages.
-        errors: the terms of the delivered model.
+        model: as delivered.
+        errors: the terms of that model, with the motion of its sensor.
         free: (k,) int64, rows of `TERMS`.
         sigma: (k,) a priori standard deviations, pixels.
         per_px: (k,) radians, metres or parts, of a parameter of one.
+        displacement: what that motion does to the image; None for none.
     """
 
     name: str
+    model: PushbroomModel
     errors: PushbroomErrors
     free: IntArray
     sigma: Array
     per_px: Array
-
-    @property
-    def model(self) -> PushbroomModel:
-        """As delivered."""
-        return self.errors.model
+    displacement: DisplacementGrid | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -72,11 +74,6 @@ class RigorousParameters:
     def deformable(self) -> bool:
         """No: a satellite holds the shape of the ground, within what its parameters are known to."""
         return False
-
-    @property
-    def displacement(self) -> None:
-        """None: parameters of the sensor are all that moves."""
-        return None
 
     @cached_property
     def credible_px(self) -> float:
@@ -117,7 +114,12 @@ class RigorousParameters:
 
 
 def rigorous_parameters(
-    name: str, model: PushbroomModel, parameter_set: ParameterSet, *, sigma_m: float
+    name: str,
+    model: PushbroomModel,
+    parameter_set: ParameterSet,
+    *,
+    sigma_m: float,
+    motion: ImageCorrection | None = None,
 ) -> RigorousParameters:
     """The parameters of a rigorous model.
 
@@ -127,6 +129,8 @@ def rigorous_parameters(
         parameter_set: which terms are free, with their a priori standard deviations.
         sigma_m: a priori standard deviation of the image on the ground, east and north each. The orbit
             has at most nine tenths of the variance: where a set states more, its orbit's sigmas shrink.
+        motion: a correction of the image whose displacement is known as a motion of the sensor, where
+            one explains it; None for none.
 
     Raises:
         InputError: the set has a term that is not one of `TERMS`.
@@ -137,7 +141,8 @@ def rigorous_parameters(
             f"{parameter_set.name}: {', '.join(sorted(unknown))} given as free, some of "
             f"{', '.join(TERMS)} expected"
         )
-    errors = PushbroomErrors(model)
+    moving = motion and moving_model(model, motion)
+    errors = PushbroomErrors(moving or model)
     _, ground = _places(model)
     _, by_ground, by_terms = errors.projected(np.zeros(len(TERMS)), ground)
     displaced_px = np.linalg.norm(by_terms, axis=1).max(axis=0)
@@ -153,7 +158,8 @@ def rigorous_parameters(
         sigma[TERMS.index(turn)] = left_m / displaced_m[TERMS.index(turn)]
     free = np.flatnonzero(sigma).astype(np.int64)
     per_px = 1.0 / displaced_px[free]
-    return RigorousParameters(name, errors, free, sigma[free] / per_px, per_px)
+    displacement = motion.displacement if motion and moving else None
+    return RigorousParameters(name, model, errors, free, sigma[free] / per_px, per_px, displacement)
 
 
 def _places(model: PushbroomModel) -> tuple[Array, Array]:

@@ -186,7 +186,9 @@ def _image(
     if scene.parameter_set is None or not isinstance(scene.model, PushbroomModel):
         return correction
     sigma_m = float(correction.prior_px[0, 0]) * scene_gsd_m(scene)
-    return rigorous_parameters(measured.name, scene.model, scene.parameter_set, sigma_m=sigma_m)
+    return rigorous_parameters(
+        measured.name, scene.model, scene.parameter_set, sigma_m=sigma_m, motion=measured.motion
+    )
 
 
 def _correction(

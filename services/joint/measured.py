@@ -1,6 +1,7 @@
 """What a scene shows of the control points, before it is adjusted together with others."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -12,7 +13,9 @@ from services.quality.lack_of_fit import Elsewhere
 from services.registration.context import SearchStage
 from services.registration.options import RegistrationOptions
 from services.registration.search import Search, control_observations
+from services.sensors.correction import ImageCorrection
 from services.sensors.displacement import DisplacementGrid
+from services.sensors.moving_pushbroom import moving_model
 from services.sensors.pushbroom import PushbroomModel
 from services.types import Array, BoolArray, ControlPoints, ViewMeasures
 
@@ -48,7 +51,7 @@ class MeasuredScene:
         matches, alone = self.search.matches, self.alone
         usable = self.search.inliers & np.isfinite(matches.line_sample).all(axis=1)
         usable &= np.isfinite(matches.sigma_px)
-        if alone and alone.components:
+        if alone and alone.components and self.motion:
             usable |= alone.active
             if any(one.kind == "break" for one in alone.components):
                 # Breaks cut chips, and leave parts that too few points hold.
@@ -57,14 +60,30 @@ class MeasuredScene:
             usable &= ~alone.moved.measures
         return np.asarray(usable)
 
-    @property
-    def displacement(self) -> DisplacementGrid | None:
-        """What moves lines and samples beyond an affine correction, as the scene alone shows it.
+    @cached_property
+    def motion(self) -> ImageCorrection | None:
+        """The correction whose displacement moves lines and samples, as the scene alone shows it.
 
         Its variance is without the covariance with the parameters, which the block estimates again.
+        None where nothing moves, and where no motion of a satellite explains it.
         """
-        grid = self.alone.correction.displacement if self.alone else None
-        return grid and replace(grid, variance_px2=np.maximum(grid.variance_px2, 0.0))
+        correction, model = self.alone.correction if self.alone else None, self.scene.model
+        if correction is None or correction.displacement is None:
+            return None
+        if (
+            self.scene.parameter_set is not None
+            and isinstance(model, PushbroomModel)
+            and moving_model(model, correction) is None
+        ):
+            return None
+        grid = correction.displacement
+        grid = replace(grid, variance_px2=np.maximum(grid.variance_px2, 0.0))
+        return replace(correction, displacement=grid)
+
+    @property
+    def displacement(self) -> DisplacementGrid | None:
+        """What moves lines and samples beyond an affine correction; None for nothing."""
+        return self.motion.displacement if self.motion else None
 
     def observations(self) -> ControlObservations:
         """What the scene shows of the points of its search."""
@@ -83,15 +102,12 @@ class MeasuredScene:
         return np.asarray(seen.line_sample + displacement.at(place) - shown)
 
 
-def options_in_block(scene: Scene, options: RegistrationOptions) -> RegistrationOptions:
+def options_in_block(options: RegistrationOptions) -> RegistrationOptions:
     """The options of a scene that is adjusted with others.
 
-    What moves lines and samples is followed beside an affine correction, not beside a rigorous model:
-    there it is tested. Bends that the points of a scene leave open are left to the tie points.
+    Bends that the points of a scene leave open are left to the tie points.
     """
-    rigorous = scene.parameter_set is not None and isinstance(scene.model, PushbroomModel)
-    profile = options.adjustment.profile and not rigorous
-    return replace(options, adjustment=replace(options.adjustment, profile=profile, bends=False))
+    return replace(options, adjustment=replace(options.adjustment, bends=False))
 
 
 def nothing_found(scene: Scene, points: ControlPoints) -> MeasuredScene:

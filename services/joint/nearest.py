@@ -1,6 +1,6 @@
 """The correction in the image that is nearest to an adjusted model, with what it misses of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -70,7 +70,7 @@ def scene_heights_m(block: JointBlock, number: int) -> tuple[float, float]:
 def _nearest(
     image: AdjustableImage, values: Array, own: Array, heights_m: tuple[float, float]
 ) -> NearestCorrection:
-    zero = no_correction(image.shape)
+    zero = replace(no_correction(image.shape), displacement=image.displacement)
     side = np.linspace(-1.0, 1.0, _SIDE)
     t = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
     t = np.tile(t, (2, 1))
@@ -79,7 +79,7 @@ def _nearest(
     computed = image.computed(values, ground)
     terms = np.column_stack([np.ones(len(t)), t])
     fitting = np.linalg.pinv(terms)
-    moved = computed.line_sample - delivered
+    moved = computed.line_sample - zero.apply(delivered)
     parameters = fitting @ moved
     missed = np.linalg.norm(moved - terms @ parameters, axis=1)
     of_values = np.einsum("an,nck->cak", fitting, computed.by_parameters)
@@ -87,7 +87,7 @@ def _nearest(
     variance = np.einsum("nck,kl,ncl->nc", beyond, own, beyond)
     projected = of_values.reshape(6, -1)
     return NearestCorrection(
-        ImageCorrection(np.asarray(parameters.T), zero.centre, zero.half_size),
+        replace(zero, parameters=np.asarray(parameters.T)),
         np.asarray(projected @ own @ projected.T),
         np.sqrt(np.maximum(variance.mean(axis=0), 0.0)),
         float(missed.max()),

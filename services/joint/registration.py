@@ -183,7 +183,7 @@ def measure_scene(
     scene: Scene, points: ControlPoints, chips: ChipSource, options: RegistrationOptions
 ) -> MeasuredScene:
     """A scene with its control points, found as those of a scene alone; with none where that fails."""
-    options = options_in_block(scene, options)
+    options = options_in_block(options)
     stages: list[SearchStage] = []
     try:
         context, search, alone = search_scene(scene, points, chips, options, stages=stages)
@@ -227,7 +227,7 @@ def _searched_again(
         model = block.model(number)
         context = PointContext(
             scene=scene,
-            options=options_in_block(scene, options),
+            options=options_in_block(options),
             progress=progress,
             stages=list(measured.stages),
             breaks=scene_breaks(scene),

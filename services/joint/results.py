@@ -13,6 +13,7 @@ from services.adjustment.parameter_figures import (
     parameter_figures,
 )
 from services.adjustment.placed_measures import PlacedMeasures
+from services.adjustment.rigorous_parameters import RigorousParameters
 from services.adjustment.shared_errors import SharedErrors
 from services.adjustment.short_motion import STILL
 from services.conventions import CHIP_SIZE
@@ -26,6 +27,7 @@ from services.quality.stability import AdjustedScene, Repetition, stability_of
 from services.registration.on_points import Registration
 from services.registration.options import RegistrationOptions
 from services.registration.point_results import point_results
+from services.sensors.moving_pushbroom import AttitudeMotion, attitude_motion
 from services.sensors.pushbroom import PushbroomModel
 from services.types import Array, BoolArray, IntArray, Measures
 
@@ -71,7 +73,7 @@ def scene_adjustment(block: JointBlock, number: int, options: RegistrationOption
         active=active,
         sigma0=float(np.sqrt(normalised[active].mean())) if active.any() else 1.0,
         point_sigma_px=np.sqrt(of_points[active].mean(axis=0)) if active.any() else np.zeros(2),
-        components=alone.components if alone else (),
+        components=alone.components if alone and measured.motion else (),
     )
 
 
@@ -98,7 +100,8 @@ class RigorousScene:
         parameters: with their standard deviations, in their units.
         held: a sentence that names those that the observations do not determine; "" where they do all.
         heights_m: lowest and highest ground of the scene, which fitted models are compared over.
-        correction_error_px: largest distance of the nearest affine correction from the adjusted model.
+        correction_error_px: largest distance of the nearest correction from the adjusted model.
+        attitude: how the satellite turns beyond the parameters; None where it does not.
     """
 
     parameter_set: str
@@ -106,14 +109,16 @@ class RigorousScene:
     held: str
     heights_m: tuple[float, float]
     correction_error_px: float
+    attitude: AttitudeMotion | None = None
 
 
 def rigorous_scene(block: JointBlock, number: int) -> RigorousScene | None:
     """What a block has found of a scene; None for a correction in the image."""
-    parameter_set = block.scenes[number].scene.parameter_set
-    if parameter_set is None or not isinstance(block.model(number), PushbroomModel):
+    image, measured = block.images[number], block.scenes[number]
+    parameter_set = measured.scene.parameter_set
+    if parameter_set is None or not isinstance(image, RigorousParameters):
         return None
-    name = block.images[number].name
+    name, motion = image.name, measured.motion
     own = [each for each in parameter_figures(block.images, block.adjustment) if each.image == name]
     return RigorousScene(
         parameter_set.name,
@@ -121,6 +126,7 @@ def rigorous_scene(block: JointBlock, number: int) -> RigorousScene | None:
         "".join(held_parameters(own)),
         scene_heights_m(block, number),
         nearest_correction(block, number).max_error_px,
+        attitude_motion(image.model, motion) if motion and image.displacement else None,
     )
 
 

@@ -22,6 +22,7 @@ from services.reports.published import (
     published_tables,
 )
 from services.reports.report import NOT_IN_JSON, BlockUsed, RegistrationReport
+from services.sensors.moving_pushbroom import AttitudeMotion
 from services.types import Array
 
 JOINT_FORMAT = "amers-joint-registration/1"
@@ -62,7 +63,8 @@ class RigorousRecord:
         heights_m: lowest and highest ground of the scene, over which its RPC is fitted.
         rpc_error_px: largest distance of that RPC from the adjusted model.
         rpc_words: the same as a sentence.
-        correction_error_px: largest distance of the nearest affine correction from the adjusted model.
+        correction_error_px: largest distance of the nearest correction from the adjusted model.
+        attitude_words: how far the satellite turns beyond the parameters, as a sentence; "" for not.
     """
 
     parameter_set: str
@@ -72,6 +74,7 @@ class RigorousRecord:
     rpc_error_px: float
     rpc_words: str
     correction_error_px: float
+    attitude_words: str
 
 
 @dataclass(frozen=True)
@@ -274,6 +277,17 @@ def _rigorous_record(found: RigorousScene | None, report: RegistrationReport) ->
         rpc_error_px=report.refined_model.max_error_px,
         rpc_words=report.refined_model.note,
         correction_error_px=found.correction_error_px,
+        attitude_words=_attitude_words(found.attitude),
+    )
+
+
+def _attitude_words(motion: AttitudeMotion | None) -> str:
+    if motion is None:
+        return ""
+    roll, pitch = 1e6 * np.abs(motion.roll_pitch_rad).max(axis=0)
+    return (
+        f"the satellite turns while it scans, by up to {roll:.2g} μrad of roll and {pitch:.2g} μrad of "
+        "pitch beyond these parameters: attitude.csv"
     )
 
 

@@ -100,7 +100,7 @@ def _rigorous(scene: JointScene) -> tuple[RenderableType, ...]:
             *(number(value) for value in (own.value, own.sigma, own.a_priori_sigma)),
             "held" if own.is_held else f"{own.determined:.0%}",
         )
-    words = [words for words in (found.held, found.rpc_words) if words]
+    words = [words for words in (found.held, found.attitude_words, found.rpc_words) if words]
     return table, Text("\n".join(words))
 
 

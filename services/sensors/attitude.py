@@ -8,6 +8,18 @@ from services.types import Array
 
 _DEGREE = 7
 _QUADRATIC = 2
+_LEAST_SHARE = 1e-9
+"""Of the whole time, between two breaks."""
+
+TURNS = np.array(
+    [
+        [[0, 0, 0, 1], [0, 0, 1, 0], [0, -1, 0, 0], [-1, 0, 0, 0]],
+        [[0, 0, -1, 0], [0, 0, 0, 1], [1, 0, 0, 0], [0, -1, 0, 0]],
+        [[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1], [0, 0, -1, 0]],
+    ],
+    dtype=np.float64,
+)
+"""(3, 4, 4): the product of a quaternion x, y, z, w with the unit i, j or k on its right."""
 
 
 def without_sign_changes(quaternions: Array) -> Array:
@@ -83,3 +95,27 @@ def orbital_attitude(
         return unsorted
 
     return from_function(angles.breaks, quaternions, _DEGREE)
+
+
+def turned_over_time(
+    attitude: PiecewisePolynomial, times: Array, turns: Array, used: tuple[float, float]
+) -> PiecewisePolynomial:
+    """Quaternions multiplied from the right by (turn / 2, 1), exactly.
+
+    Args:
+        attitude: ecef_from_body as quaternions x, y, z, w, of the seconds.
+        times: (m,) seconds, increasing.
+        turns: (m, 3) radians about the axes of the body then, small; straight lines between the times,
+            constant before the first and after the last.
+        used: first and last time at which the result is used.
+    """
+
+    def turned(t: Array) -> Array:
+        quaternions = attitude(t)
+        at = np.column_stack([np.interp(t, times, turns[:, k]) for k in range(3)])
+        return np.asarray(quaternions + np.einsum("nk,kab,nb->na", at / 2.0, TURNS, quaternions))
+
+    inside = times[(times > used[0]) & (times < used[1])]
+    breaks = np.unique(np.concatenate([attitude.breaks, inside, used]))
+    apart = np.diff(breaks, prepend=-np.inf) > _LEAST_SHARE * (breaks[-1] - breaks[0])
+    return from_function(breaks[apart], turned, attitude.coefficients.shape[2])

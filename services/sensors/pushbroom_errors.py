@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from services.geodesy import ecef_from_east_north_up
+from services.sensors.attitude import TURNS
 from services.sensors.piecewise import PiecewisePolynomial
 from services.sensors.pushbroom import PushbroomModel
 from services.types import Array
@@ -52,7 +53,7 @@ class PushbroomErrors:
         return self.model.look(np.array([(self.model.image_shape[1] - 1.0) / 2.0]))[0]
 
     @cached_property
-    def _view_axes(self) -> Array:
+    def view_axes(self) -> Array:
         """Axes (3, 3) of the central line of sight as columns, in the body frame."""
         z = np.append(self._central_look, 1.0) / np.linalg.norm(np.append(self._central_look, 1.0))
         y = np.cross(z, [1.0, 0.0, 0.0])
@@ -84,7 +85,7 @@ class PushbroomErrors:
         look[:, :, -1] += self._central_look * (1.0 - stretch)
         return self.model.with_parts(
             orbit=_moved(self.model.orbit, move @ self._orbit_axes.T, self._times),
-            attitude=_turned(self.model.attitude, turn @ self._view_axes.T, self._times),
+            attitude=_turned(self.model.attitude, turn @ self.view_axes.T, self._times),
             look=replace(self.model.look, coefficients=look),
         )
 
@@ -106,7 +107,7 @@ class PushbroomErrors:
         turned = np.empty((len(image), 2, 3))
         turned[:, 0] = np.column_stack([along * across, -1.0 - along**2, across])
         turned[:, 1] = np.column_stack([1.0 + across**2, -along * across, -along])
-        by_turn = by_tangents @ turned @ self._view_axes
+        by_turn = by_tangents @ turned @ self.view_axes
         to_ecef = ecef_from_east_north_up(lon_lat_h)
         by_move = -by_ground @ to_ecef.transpose(0, 2, 1) @ self._orbit_axes
         off_centre = (look - self._central_look) / _stretch(terms[12:])
@@ -142,7 +143,7 @@ def _turned(
 ) -> PiecewisePolynomial:
     """Quaternions multiplied from the right by (turn / 2, 1): a constant (3,), and one that grows."""
     middle, half = _since(attitude, times)
-    constant, growing = (np.einsum("k,kab->ab", part / 2.0, _TURNS) for part in turn)
+    constant, growing = (np.einsum("k,kab->ab", part / 2.0, TURNS) for part in turn)
     coefficients = _padded(attitude.coefficients, attitude.coefficients.shape[2])
     # Highest power first: the product with the time moves every coefficient to the next power.
     product = growing @ coefficients
@@ -157,14 +158,3 @@ def _padded(coefficients: Array, degree: int) -> Array:
     """Coefficients of at least a degree, a new array."""
     missing = max(0, degree + 1 - coefficients.shape[2])
     return np.pad(coefficients, ((0, 0), (0, 0), (missing, 0)))
-
-
-_TURNS = np.array(
-    [
-        [[0, 0, 0, 1], [0, 0, 1, 0], [0, -1, 0, 0], [-1, 0, 0, 0]],
-        [[0, 0, -1, 0], [0, 0, 0, 1], [1, 0, 0, 0], [0, -1, 0, 0]],
-        [[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1], [0, 0, -1, 0]],
-    ],
-    dtype=np.float64,
-)
-"""(3, 4, 4): the product of a quaternion x, y, z, w with the unit i, j or k on its right."""

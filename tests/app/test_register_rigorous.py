@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,7 +20,9 @@ from services.formats.images.raster import gdal_rpc
 from services.formats.sensor_models.correction_json import parse_correction
 from services.formats.sensor_models.rpc_files import read_rpc
 from services.reports.document import joint_schema, report_schema
-from services.sensors.correction import CorrectedModel
+from services.sensors.correction import CorrectedModel, no_correction
+from services.sensors.displacement import DisplacementGrid
+from services.sensors.moving_pushbroom import moving_model
 from services.sensors.pushbroom import PushbroomModel
 from services.sensors.pushbroom_errors import TERMS, PushbroomErrors
 from services.simulation.orbit import pushbroom_over
@@ -42,9 +45,21 @@ pytestmark = [pytest.mark.long, pytest.mark.thorough]
 SHAPE, SIZE = (2400, 3000), 800
 FIRST = (900.0, 1300.0)
 """Line and sample of the first pixel of the images in the scenes of their metadata."""
-VIEWS = {"orbit_a": (14.0, 100.0), "orbit_b": (9.0, 270.0), "orbit_c": (18.0, 20.0)}
-MICRORADIANS = {"orbit_a": (6.0, -5.0), "orbit_b": (-7.0, 4.0), "orbit_c": (4.0, 6.0)}
+VIEWS = {
+    "orbit_a": (14.0, 100.0),
+    "orbit_b": (9.0, 270.0),
+    "orbit_c": (18.0, 20.0),
+    "swinging": (11.0, 190.0),
+}
+MICRORADIANS = {
+    "orbit_a": (6.0, -5.0),
+    "orbit_b": (-7.0, 4.0),
+    "orbit_c": (4.0, 6.0),
+    "swinging": (5.0, -4.0),
+}
 """By how much roll and pitch in the metadata are off: 3 to 5 m on the ground."""
+SWING_PX = 3.0, 4.0
+"""Of lines and samples of the image that swings, half a wave along it."""
 A_FIFTH_OF_A_PIXEL = 0.2
 
 
@@ -67,12 +82,24 @@ def true_model(name: str) -> PushbroomModel:
     """Where the image truly shows the ground, in its own pixels."""
     terms = np.zeros(len(TERMS))
     terms[:2] = np.array(MICRORADIANS[name]) * 1e-6
-    return PushbroomErrors(delivered(name)).corrected(terms).cropped(FIRST, (SIZE, SIZE))
+    model = PushbroomErrors(delivered(name)).corrected(terms).cropped(FIRST, (SIZE, SIZE))
+    if name != "swinging":
+        return model
+    moving = moving_model(model, replace(no_correction((SIZE, SIZE)), displacement=swing()))
+    assert moving is not None
+    return moving
+
+
+def swing() -> DisplacementGrid:
+    lines, samples = np.linspace(0.0, SIZE - 1.0, 101), np.array([0.0, SIZE - 1.0])
+    wave = np.sin(np.pi * lines / SIZE)[:, None, None] * np.array(SWING_PX)
+    grid = np.repeat(wave, 2, axis=1)
+    return DisplacementGrid(lines, samples, grid, np.zeros_like(grid))
 
 
 @pytest.fixture(scope="module")
 def folder(world: FlatWorld, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three parts of scenes with DIMAP metadata beside them, and an image with RPC tags."""
+    """Four parts of scenes with DIMAP metadata beside them, and an image with RPC tags."""
     folder = tmp_path_factory.mktemp("scenes")
     rng = np.random.default_rng(8)
     grid = np.stack(np.meshgrid(np.arange(SIZE), np.arange(SIZE), indexing="ij"), axis=-1)
@@ -161,6 +188,29 @@ def test_rigorous_scenes_and_an_rpc_are_registered_in_one_block(
     for words in ("pitch drift", "focal length", "an RPC fitted to the adjusted rigorous model within"):
         assert words in page
         assert words in text
+
+
+def test_a_satellite_that_swings_is_told_by_its_attitude(
+    world: FlatWorld, folder: Path, tmp_path: Path
+) -> None:
+    """Its points lie on the middle half of the lines: beyond them nobody knows how it swings."""
+    images = [folder / "IMG_swinging.tif", folder / "IMG_orbit_a.tif", folder / "rpc.tif"]
+    done = register(world, tmp_path / "out", *images, "--rigorous", "srp")
+    assert done.returncode == 3, done.stderr
+    assert "IMG_swinging.tif: the registration has the verdict failed (Predicted CE90" in done.stderr
+    own, block = (tmp_path / "out" / name for name in ("IMG_swinging", "block"))
+    correction = parse_correction((own / "correction.json").read_text())
+    model = CorrectedModel(delivered("swinging").cropped(FIRST, (SIZE, SIZE)), correction)
+    lines, samples = np.meshgrid(np.linspace(230.0, 570.0, 9), np.linspace(50.0, SIZE - 51.0, 9))
+    at = np.column_stack([lines.ravel(), samples.ravel()])
+    shown = model.project(true_model("swinging").locate(at, np.full(len(at), GROUND_H)))
+    assert np.linalg.norm(shown - at, axis=1).max() < 3.0 * A_FIFTH_OF_A_PIXEL
+    turns = np.loadtxt(own / "attitude.csv", delimiter=",", skiprows=1)
+    assert (np.diff(turns[:, :2], axis=0) > 0.0).all()
+    page = (block / "report.html").read_text()
+    assert f"by up to {np.abs(turns[:, 2]).max():.2g} μrad of roll" in page
+    assert "Use correction.json or attitude.csv with the delivered rigorous model" in page
+    assert not (tmp_path / "out" / "IMG_orbit_a" / "attitude.csv").exists()
 
 
 @pytest.mark.endurance

@@ -284,7 +284,9 @@ def _written(
     registration, found = result
     model: SensorModel | AdjustedRigorous = registration.model
     if found is not None:
-        model = AdjustedRigorous(registration.model, found.heights_m, found.correction_error_px)
+        model = AdjustedRigorous(
+            registration.model, found.heights_m, found.correction_error_px, found.attitude
+        )
     folder.mkdir(parents=True, exist_ok=True)
     refined = write_refined(
         files.image,

@@ -6,6 +6,7 @@ from pathlib import Path
 from services.adjustment.image_correction import SceneAdjustment
 from services.formats.images.ortho import write_refined_ortho
 from services.formats.images.raster import open_raster
+from services.formats.sensor_models.attitude_csv import ATTITUDE_CSV, format_attitude
 from services.formats.sensor_models.correction_json import format_correction
 from services.formats.sensor_models.rpc_files import (
     DeliveredModel,
@@ -17,6 +18,7 @@ from services.formats.sensor_models.rpc_files import (
 from services.map_grid import MapGrid
 from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel
+from services.sensors.moving_pushbroom import AttitudeMotion
 from services.sensors.ortho import OrthoModel, fold_into_ortho
 from services.sensors.refined import LOUD_PX, REFIT_LIMIT_PX, refined_rpc
 from services.sensors.rpc import RpcModel
@@ -37,11 +39,13 @@ class AdjustedRigorous:
         model: adjusted.
         heights_m: lowest and highest ground of the scene, over which an RPC is fitted.
         correction_error_px: largest distance of the nearest correction from the adjusted model.
+        attitude: how the satellite turns beyond the parameters; None where it does not.
     """
 
     model: SensorModel
     heights_m: tuple[float, float]
     correction_error_px: float
+    attitude: AttitudeMotion | None = None
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,7 @@ def write_refined(
     | `_RPC.TXT`, RPB, DIMAP, `.geom` | the file under its own name |
     | map grid | `IMAGE.aux.xml`, which GDAL prefers to the map grid of the image beside it |
     | adjusted rigorous model | as for an RPC, the one fitted to it; the note states its error |
+    | the same, of a satellite that turns beyond the parameters | also `attitude.csv` |
     | any of a GeoTIFF | a copy of the image with new tags, when `copy_image` |
 
     An RPC that differs from the corrected model by 0.01 px or more is not written: `correction.json`
@@ -129,9 +134,11 @@ def write_refined(
         apart_px=adjustment.apart_px,
     )
     (folder / CORRECTION_JSON).write_text(text, encoding="utf-8")
-    return RefinedFiles(
-        (folder / CORRECTION_JSON, *model_files.files), model_files.max_error_px, model_files.note
-    )
+    files = [folder / CORRECTION_JSON, *model_files.files]
+    if isinstance(model, AdjustedRigorous) and model.attitude:
+        files.append(folder / ATTITUDE_CSV)
+        files[-1].write_text(format_attitude(model.attitude), encoding="utf-8")
+    return RefinedFiles(tuple(files), model_files.max_error_px, model_files.note)
 
 
 def _write_rpc(
@@ -181,6 +188,8 @@ def _write_fitted(
     )
     if off_px > FIT_LIMIT_PX:
         note = f"WARNING: more than {FIT_LIMIT_PX:g} px off: {note}; no RPC follows this attitude closer"
+        if adjusted.attitude:
+            note += f". Use {CORRECTION_JSON} or {ATTITUDE_CSV} with the delivered rigorous model"
     return RefinedFiles(tuple(files), off_px, note)
 
 

@@ -383,9 +383,7 @@ def test_what_points_share_is_in_the_accuracy_of_a_scene_of_a_block() -> None:
 
 
 def test_bends_that_the_points_of_a_scene_leave_open_are_left_to_the_ties() -> None:
-    truth = truth_of(np.random.default_rng(6))
-    scene = measured_scene(truth, 0, np.random.default_rng(6)).scene
-    own = options_in_block(scene, OPTIONS).adjustment
+    own = options_in_block(OPTIONS).adjustment
     assert (OPTIONS.adjustment.bends, own.bends) == (True, False)
     assert own == replace(OPTIONS.adjustment, bends=False)
 

@@ -1,6 +1,6 @@
 """Rigorous models registered together with RPCs and ortho-images: as accurate as stated, and by name."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 
 import numpy as np
@@ -32,6 +32,7 @@ from services.registration.options import RegistrationOptions
 from services.sensors.correction import CorrectedModel, no_correction
 from services.sensors.ortho import OrthoModel
 from services.sensors.parameter_sets import SRP, TOUTIN, ParameterSet
+from services.sensors.pushbroom import PushbroomModel
 from services.sensors.refined import refined_rpc
 from services.sensors.rpc_fit import fit_rpc
 from services.simulation.world import World, make_world
@@ -58,13 +59,21 @@ class RigorousTruth(SceneTruth):
     parameter_set: ParameterSet
 
     def position(self, lon_lat_h: Array) -> Array:
-        position = self.delivered.corrected(self.values).project(lon_lat_h)
-        wave = np.sin(2.0 * np.pi * position[:, :1] / self.shape[0])
-        return np.asarray(position + wave * np.array(self.plan.bend_px))
+        return self.moved(self.delivered.corrected(self.values).project(lon_lat_h))
 
     def scene(self) -> Scene:
         model = self.delivered.model
         return replace(super().scene(), model=model, parameter_set=self.parameter_set)
+
+
+@dataclass(frozen=True)
+class BrokenTruth(RigorousTruth):
+    """An image of which 25 lines were lost in the middle."""
+
+    def position(self, lon_lat_h: Array) -> Array:
+        position = super().position(lon_lat_h)
+        position[:, 0] -= np.where(position[:, 0] > 0.5 * self.shape[0], 25.0, 0.0)
+        return position
 
 
 @cache
@@ -259,6 +268,62 @@ def test_every_scene_of_a_mixed_block_is_qualified_and_has_an_rpc() -> None:
     refined = refined_rpc(block.model(0), SHAPE, found.heights_m)
     assert refined.model is not None
     assert refined.max_error_px < 0.01
+
+
+@pytest.mark.monte_carlo
+@pytest.mark.parametrize("swing_px", [(5.0, 3.0), (0.0, 6.0)])
+def test_a_rigorous_scene_that_swings_is_followed_with_the_stated_accuracy(
+    swing_px: tuple[float, float],
+) -> None:
+    """The motion is in the attitude of its model, and in the correction that is nearest to it."""
+    squares, errors, attitudes = [], [], []
+    side = np.linspace(0.03, 0.97, 9) * SHAPE[0]
+    at = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+    for trial in range(TRIALS):
+        rng = np.random.default_rng([37, trial])
+        truth = mixed(rng)
+        swings = rigorous_truth(plan_of(0, swing_px=swing_px), SRP, rng)
+        truth = replace(truth, images=(swings, *truth.images[1:]))
+        block, left = adjust_fitting(*observed(truth, rng), OPTIONS)
+        assert not left
+        model = block.model(0)
+        assert isinstance(model, PushbroomModel)
+        error, _ = errors_px(truth, 0, model, at)
+        stated = scene_adjustment(block, 0, OPTIONS).covariance_at(at)
+        square = (error * np.linalg.solve(stated, error[:, :, None])[:, :, 0]).sum(axis=1) / 2.0
+        squares.append(float(square.mean()))
+        errors.append(float(np.quantile(np.hypot(*error.T), 0.9)))
+        nearest = nearest_correction(block, 0)
+        assert nearest.correction.displacement is not None
+        assert nearest.max_error_px < 0.3
+        attitudes.append(len(model.attitude.breaks) > len(swings.delivered.model.attitude.breaks))
+        assert max(normalised(truth, block, number) for number in range(1, 4)) < 4.0
+    assert all(attitudes)
+    assert 0.5 < np.mean(squares) < 1.7
+    assert np.median(errors) < 0.35 * np.hypot(*swing_px)
+
+
+@pytest.mark.monte_carlo
+def test_a_rigorous_scene_that_lost_lines_is_right_on_both_sides_of_them() -> None:
+    """Its points say where the lines are missing to within the gap between two of them."""
+    squares, errors = [], []
+    for trial in range(TRIALS):
+        rng = np.random.default_rng([38, trial])
+        truth = mixed(rng)
+        whole = rigorous_truth(plan_of(0, name="broken"), SRP, rng)
+        broken = BrokenTruth(**{field.name: getattr(whole, field.name) for field in fields(whole)})
+        truth = replace(truth, images=(broken, *truth.images[1:]))
+        block, left = adjust_fitting(*observed(truth, rng), OPTIONS)
+        assert not left
+        at = rng.uniform(0.0, 1.0, (2000, 2)) * SHAPE
+        at = at[np.abs(at[:, 0] - 0.5 * SHAPE[0]) > 2000.0]
+        error, _ = errors_px(truth, 0, block.model(0), at)
+        stated = scene_adjustment(block, 0, OPTIONS).covariance_at(at)
+        square = (error * np.linalg.solve(stated, error[:, :, None])[:, :, 0]).sum(axis=1) / 2.0
+        squares.append(float(square.mean()))
+        errors.append(float(np.quantile(np.hypot(*error.T), 0.9)))
+    assert 0.5 < np.mean(squares) < 2.5
+    assert np.median(errors) < 1.0
 
 
 @pytest.mark.long
