@@ -12,7 +12,7 @@ from app.db.engine import Connection
 from app.db.scene_files import SceneFiles, read_scene_files
 from app.usecases.media_types import media_type
 from app.usecases.processes import result_name
-from app.usecases.registration.deliverables import OUTPUTS
+from app.usecases.registration.deliverables import TITLES
 
 VERSION = "1.1.0"
 COLLECTION = "scenes"
@@ -119,7 +119,7 @@ def _assets(files: SceneFiles, base: str) -> dict[str, dict[str, Any]]:
         title = "A file delivered beside the image."
         assets[name] = _asset(f"{scene}/{name}", scene_media_type(name), title, "metadata")
     for name, stored_key in sorted(files.results.items()):
-        title = OUTPUTS.get(name, "The refined model in the format of the delivered one.")
+        title = TITLES.get(name, "The refined model in the format of the delivered one.")
         href = f"{base}jobs/{files.job_id}/results/{result_name(stored_key)}"
         key = RESULTS.get(name, name)
         assets[key if key not in assets else f"refined-{key}"] = _asset(

@@ -29,10 +29,12 @@ OUTPUTS = {
     "gcp_list.txt": "The active control points for OpenDroneMap.",
     "residuals.gpkg": "Residual vectors and control points as layers of a GeoPackage.",
     "correction.json": "The correction, for every kind of sensor model.",
-    "attitude.csv": "Roll and pitch over time of a rigorous model whose lines move.",
     "refined_RPC.TXT": "The refined model as RPC text, in the pixels of the image, unless none fits.",
 }
 """Outputs of a registration; the refined model in the format of the input comes in addition."""
+
+TITLES = {**OUTPUTS, "attitude.csv": "Roll and pitch over time of a rigorous model whose lines move."}
+"""What files of a registration are, alone or together with others."""
 
 
 def write_outputs(
