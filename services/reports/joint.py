@@ -286,7 +286,7 @@ def _attitude_words(motion: AttitudeMotion | None) -> str:
         return ""
     roll, pitch = 1e6 * np.abs(motion.roll_pitch_rad).max(axis=0)
     return (
-        f"the satellite turns while it scans, by up to {roll:.2g} μrad of roll and {pitch:.2g} μrad of "
+        f"The satellite turns while it scans, by up to {roll:.2g} μrad of roll and {pitch:.2g} μrad of "
         "pitch beyond these parameters: attitude.csv"
     )
 

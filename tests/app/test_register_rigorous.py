@@ -209,7 +209,7 @@ def test_a_satellite_that_swings_is_told_by_its_attitude(
     assert (np.diff(turns[:, :2], axis=0) > 0.0).all()
     page = (block / "report.html").read_text()
     assert f"by up to {np.abs(turns[:, 2]).max():.2g} μrad of roll" in page
-    assert "Use correction.json or attitude.csv with the delivered rigorous model" in page
+    assert "Use correction.json with the delivered rigorous model, or its parameters as found" in page
     assert not (tmp_path / "out" / "IMG_orbit_a" / "attitude.csv").exists()
 
 

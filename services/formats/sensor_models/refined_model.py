@@ -189,7 +189,10 @@ def _write_fitted(
     if off_px > FIT_LIMIT_PX:
         note = f"WARNING: more than {FIT_LIMIT_PX:g} px off: {note}; no RPC follows this attitude closer"
         if adjusted.attitude:
-            note += f". Use {CORRECTION_JSON} or {ATTITUDE_CSV} with the delivered rigorous model"
+            note += (
+                f". Use {CORRECTION_JSON} with the delivered rigorous model, or its parameters as found "
+                f"and {ATTITUDE_CSV}"
+            )
     return RefinedFiles(tuple(files), off_px, note)
 
 
