@@ -303,6 +303,23 @@ def test_a_rigorous_scene_that_swings_is_followed_with_the_stated_accuracy(
     assert np.median(errors) < 0.35 * np.hypot(*swing_px)
 
 
+@pytest.mark.long
+def test_a_scene_joins_no_block_in_which_a_satellite_turns() -> None:
+    """The motion is not kept with the block: all scenes have to be registered together."""
+    rng = np.random.default_rng(39)
+    truth = mixed(rng)
+    swings = rigorous_truth(plan_of(0, swing_px=(5.0, 3.0)), SRP, rng)
+    truth = replace(truth, images=(swings, *truth.images[1:]))
+    scenes, ties = observed(truth, rng)
+    first, _ = adjust_fitting(scenes[:2], ties_between(ties, [0, 1]), OPTIONS)
+    none = np.zeros(0, np.int64)
+    before = [nothing_found(one.scene, one.points.take(none)) for one in scenes[:2]]
+    with pytest.raises(InputError, match=r"image 1: .* register the scenes of both together"):
+        adjust_fitting(
+            [*before, scenes[2]], ties_between(ties, [0, 1, 2]), OPTIONS, first.adjustment.known
+        )
+
+
 @pytest.mark.monte_carlo
 def test_a_rigorous_scene_that_lost_lines_is_right_on_both_sides_of_them() -> None:
     """Its points say where the lines are missing to within the gap between two of them."""
