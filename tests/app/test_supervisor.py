@@ -21,7 +21,8 @@ children = [
 supervisor.run(children, at_stop=lambda: print("stops", flush=True))
 sys.exit(supervisor.exit_code)
 """
-REPORTS = "import os, signal, time; print('{0}', os.getpid(), flush=True); "
+REPORTS = r"import os, signal, time; os.write(1, b'{0} %d\n' % os.getpid()); "
+"""In one write: two processes write into the same log."""
 LIVES = REPORTS + "time.sleep(1000)"
 CRASHES = REPORTS + "os.kill(os.getpid(), signal.SIGSEGV)"
 REFUSES = "sys.exit(3)"
