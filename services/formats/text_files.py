@@ -44,9 +44,10 @@ def parse_number(text: str, key: str, source: str) -> float:
     Raises:
         FormatError: the text is not a decimal number; "nan" and "inf" are not.
     """
-    if re.fullmatch(NUMBER_PATTERN, text.strip()) is None:
-        raise FormatError(f"{source}: {key}: expected a number, found {text.strip()[:60]!r}")
-    return float(text)
+    number = text.strip()  # of more than `float` would: the information separators of ASCII, too
+    if re.fullmatch(NUMBER_PATTERN, number) is None:
+        raise FormatError(f"{source}: {key}: expected a number, found {number[:60]!r}")
+    return float(number)
 
 
 def load_json(text: str, source: str) -> Any:

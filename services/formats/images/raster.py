@@ -126,8 +126,10 @@ class RasterImage:
         dtype = np.dtype(self.dataset.dtypes[band - 1])
         if dtype.kind not in "ui" or dtype.itemsize < 2:
             return ()
+        largest = int(np.iinfo(dtype).max)
         bits = self.dataset.tags(band, ns="IMAGE_STRUCTURE").get("NBITS", "")
-        largest = int(2 ** int(bits) - 1) if bits.isdigit() else int(np.iinfo(dtype).max)
+        if bits.isdecimal() and len(bits) <= 2:  # a file beside the image may say anything
+            largest = min(largest, 2 ** int(bits) - 1)
         stated = self.codes.saturated
         return (largest,) if stated in (None, largest) else (largest, stated)
 

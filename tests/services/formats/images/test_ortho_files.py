@@ -256,6 +256,21 @@ def test_twelve_bits_in_sixteen_have_no_largest_value_unless_somebody_states_it(
     assert np.isfinite(open_raster(write(tmp_path / "a.tif", pixels)).read(ALL)).all()
 
 
+@pytest.mark.parametrize("bits", ["99", "9" * 20, "²", ""])
+def test_impossible_bits_that_a_file_beside_the_image_states_are_those_of_the_pixels(
+    tmp_path: Path, bits: str
+) -> None:
+    pixels = PIXELS[:1].copy()
+    pixels[0, 3:5, 6:9] = 65535
+    path = write(tmp_path / "a.tif", pixels)
+    (tmp_path / "a.tif.aux.xml").write_text(
+        '<PAMDataset><PAMRasterBand band="1"><Metadata domain="IMAGE_STRUCTURE">'
+        f'<MDI key="NBITS">{bits}</MDI></Metadata></PAMRasterBand></PAMDataset>'
+    )
+    read = open_raster(path).read(ALL)
+    np.testing.assert_array_equal(read == np.inf, pixels[0] == 65535)
+
+
 def test_a_mix_is_saturated_where_one_band_is_and_without_data_where_one_has_none(
     tmp_path: Path,
 ) -> None:

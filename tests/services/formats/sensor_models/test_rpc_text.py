@@ -18,6 +18,7 @@ from services.formats.sensor_models.rpc_text import (
     parse_rpc_text,
     rpb_satellite,
 )
+from services.formats.text_files import parse_number
 from services.sensors.rpc import RpcModel
 
 TEXT = (Path(__file__).parents[3] / "golden" / "invented_RPC.TXT").read_text()
@@ -107,6 +108,11 @@ def test_a_wrong_field_of_the_rpb_is_named(was: str, becomes: str, says: str) ->
     assert was in RPB
     with pytest.raises(FormatError, match=says):
         parse_rpb(RPB.replace(was, becomes))
+
+
+@pytest.mark.parametrize("blank", ["\t", "\x1c", "\x1d", "\x1e", "\x1f", "\x85", "\u00a0", "\u2003"])
+def test_whatever_text_calls_blank_may_stand_around_a_number(blank: str) -> None:
+    assert parse_number(f"{blank}12.5{blank}", "height", "a file") == 12.5
 
 
 def read_or_refuse(parse, text: str) -> None:
