@@ -1,18 +1,23 @@
-"""The coarse search of a scene whose model may be far off: few points, far out, and a consensus."""
+"""The coarse search of a scene whose model may be far off: few points, far out, and a consensus.
+
+Coarse chips reach far, but few of them fit side by side, and clouds hide each with all its ground. Where
+they agree no better than by chance, more points are searched with the finest chips.
+"""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from services.conventions import CHIP_CENTRE, CHIP_SIZE, MAX_ERROR_SIGMAS
 from services.imagery.scene import Scene, scene_gsd_m
 from services.imagery.source import ImageSource, ReducedImage, reduce_image
-from services.matching.consensus import Voters
+from services.matching.consensus import Consensus, Voters
 from services.matching.control_points import ChipSearch, match_points
 from services.matching.correlate import PeakThresholds
 from services.registration.another_view import another_view
 from services.registration.chip_selection import has_chip, visibility_probability
-from services.registration.context import PointContext, Prediction
+from services.registration.context import PointContext, Prediction, SearchStage
 from services.registration.far import search_far
 from services.registration.point_selection import points_expected
 from services.registration.search import (
@@ -25,6 +30,20 @@ from services.registration.search import (
     search_radius_px,
     summarise,
 )
+from services.types import IntArray
+
+_TRIES = 2
+"""Searches of which one has to agree, and the better one is the last of the summaries: two tries are
+two chances."""
+
+
+@dataclass(frozen=True)
+class _Agreement:
+    """A search of points far out, what it agrees on, and its summary."""
+
+    search: Search
+    consensus: Consensus
+    stage: SearchStage
 
 
 def needs_coarse_search(context: PointContext, prediction: Prediction) -> bool:
@@ -53,11 +72,53 @@ def search_coarsely(context: PointContext, prediction: Prediction) -> Prediction
         prediction = search_far(part, context.points, context.chips, prediction, gsd_m)
         if not needs_coarse_search(context, prediction):
             return prediction
-        gsd_m, error_m = _coarse_gsd_m(context, prediction), largest_error_m(prediction.uncertainty_m)
-    radius_px = search_radius_px(error_m, gsd_m)
-    rows = points_expected(scene, context.points, prediction, gsd_m, count=options.coarse.points)
-    points = context.points.take(rows)
+        gsd_m = _coarse_gsd_m(context, prediction)
     context.progress(0.0, "coarse search")
+    rows = points_expected(scene, context.points, prediction, gsd_m, count=options.coarse.points)
+    tries = [_search(context, prediction, gsd_m, rows)]
+    max_false_alarms = options.coarse.max_false_alarms / _TRIES
+    if tries[0].consensus.false_alarms > max_false_alarms:
+        tries += _with_more_chips(context, prediction, tries[0].search)
+        tries.sort(key=lambda one: one.consensus.false_alarms, reverse=True)
+    context.stages.extend(one.stage for one in tries)
+    best = tries[-1]
+    search, stage = best.search, best.stage
+    measured, lon_lat_h = search.matches.line_sample, search.points.lon_lat_h
+    predicted = prediction.model.project(lon_lat_h)
+    check_consensus(
+        stage,
+        best.consensus,
+        search.matches.reason,
+        scene,
+        max_false_alarms,
+        of_another=lambda: another_view(scene, stage, lon_lat_h, predicted, measured),
+    )
+    adjustment = adjust_search(scene, search, options.adjustment, min_points=min(3, stage.inliers))
+    corrected = predict(scene, context.points, adjustment)
+    uncertainty_m = np.hypot(corrected.uncertainty_m, stage.chip_gsd_m / 2.0)
+    return Prediction(corrected.model, uncertainty_m)
+
+
+def _with_more_chips(context: PointContext, prediction: Prediction, search: Search) -> list[_Agreement]:
+    """The search of more points with the finest chips, if there are more or finer ones within reach."""
+    options, points = context.options, context.points
+    gsd_m = float(points.views.gsd_m.min())
+    rows = points_expected(
+        context.scene, points, prediction, gsd_m, count=options.max_points or len(points)
+    )
+    is_finer = CHIP_SIZE * gsd_m < search.chip_side_m
+    radius_px = search_radius_px(largest_error_m(prediction.uncertainty_m), gsd_m)
+    if radius_px > options.coarse.max_search_px or not (is_finer or len(rows) > len(search.rows)):
+        return []
+    return [_search(context, prediction, gsd_m, rows)]
+
+
+def _search(context: PointContext, prediction: Prediction, gsd_m: float, rows: IntArray) -> _Agreement:
+    """What some of the points agree on."""
+    scene, options = context.scene, context.options
+    error_m = largest_error_m(prediction.uncertainty_m)
+    radius_px = search_radius_px(error_m, gsd_m)
+    points = context.points.take(rows)
     chip_search = ChipSearch(
         _image_for(scene, gsd_m, len(points), radius_px),
         prediction.model,
@@ -67,10 +128,9 @@ def search_coarsely(context: PointContext, prediction: Prediction) -> Prediction
         thresholds=PeakThresholds(options.coarse.min_score, max_second=1.0),
     )
     matches = match_points(chip_search, points, context.chips, options.matching, context.progress)
-    predicted = prediction.model.project(points.lon_lat_h)
     consensus = first_consensus(
         scene,
-        predicted,
+        prediction.model.project(points.lon_lat_h),
         matches.line_sample,
         level_m=gsd_m,
         radius_m=radius_px * gsd_m,
@@ -86,20 +146,8 @@ def search_coarsely(context: PointContext, prediction: Prediction) -> Prediction
         voters=Voters(matches.line_sample, CHIP_SIZE * gsd_m / scene_gsd_m(scene)),
         lon_lat_h=points.lon_lat_h,
     )
-    context.stages.append(stage)
-    check_consensus(
-        stage,
-        consensus,
-        matches.reason,
-        scene,
-        options.coarse.max_false_alarms,
-        of_another=lambda: another_view(scene, stage, points.lon_lat_h, predicted, matches.line_sample),
-    )
     search = Search(points, rows, matches, consensus.inliers, CHIP_SIZE * gsd_m)
-    adjustment = adjust_search(scene, search, options.adjustment, min_points=min(3, stage.inliers))
-    corrected = predict(scene, context.points, adjustment)
-    uncertainty_m = np.hypot(corrected.uncertainty_m, gsd_m / 2.0)
-    return Prediction(corrected.model, uncertainty_m)
+    return _Agreement(search, consensus, stage)
 
 
 def _coarse_gsd_m(context: PointContext, prediction: Prediction) -> float:

@@ -49,6 +49,9 @@ from services.types import (
     no_progress,
 )
 
+_FEWEST_REPEATED = 4
+"""Points with which an adjustment is repeated: also a scene of the fewest points that a registration
+takes can be repeated without some of them."""
 _AGREEING = 12
 """Points that agree on an image that is turned, at least, and half of those found."""
 _FEW_POINTS = 60
@@ -237,7 +240,14 @@ def build_registration(
 
     def refit(used: BoolArray) -> SceneAdjustment:
         usable = used[search.rows]
-        return adjust_search(scene, search, options.adjustment, usable=usable, like=adjustment)
+        return adjust_search(
+            scene,
+            search,
+            options.adjustment,
+            usable=usable,
+            min_points=_FEWEST_REPEATED,
+            like=adjustment,
+        )
 
     frame = shared_frame(points, measures.active)
     model = CorrectedModel(scene.model, adjustment.correction)

@@ -24,7 +24,8 @@ class CoarseOptions:
         max_search_px: largest search radius around single points, pixels of their chips; further out,
             the whole scene is searched.
         max_reduction: largest reduction of a chip; below 25 pixels a chip is hardly distinctive.
-        max_false_alarms: a consensus with more expected false alarms than this is refused.
+        max_false_alarms: a scene whose first searches, all together, have more expected false alarms
+            than this is refused.
     """
 
     max_fine_radius_px: int = 24

@@ -13,8 +13,8 @@ from services.sensors.correction import CorrectedModel, no_correction
 from services.types import Array, ControlPoints, IntArray
 
 MIN_RELATIVE_PROBABILITY = 0.5
-"""Drop points whose probability of being shown is below this fraction of the best point's, where there
-are more points than are tried."""
+"""Points whose probability of being shown is below this fraction of the best point's are tried only where
+fewer others exist than are tried."""
 
 
 def visible_points(scene: Scene, points: ControlPoints) -> IntArray:
@@ -61,6 +61,8 @@ def points_to_try(
     finest_m = float(points.views.gsd_m.min())
     probability = visibility_probability(scene, points, prediction, finest_m, MIN_VISIBLE_SIDE)
     likely = np.flatnonzero(probability >= MIN_RELATIVE_PROBABILITY * probability.max())
+    if len(likely) < count:
+        return np.sort(np.argsort(-probability, kind="stable")[:count])
     variance_m2 = np.trace(points.covariance_m2, axis1=1, axis2=2)
     preference = points.saliency * points.health
     preference /= 1.0 + variance_m2 / max(float(np.median(variance_m2)), 1e-12)
