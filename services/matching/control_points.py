@@ -121,6 +121,7 @@ class ChipSearch:
         gsd_m: ground sampling of the chips to use, metres.
         radius_px: search radius, pixels of the chips.
         thresholds: of the correlation of grey values; None takes those of the options.
+        half_side: of the part of each chip, around its point, that is searched, pixels of the chips.
     """
 
     image: ImageSource | ReducedImage
@@ -129,6 +130,7 @@ class ChipSearch:
     gsd_m: float
     radius_px: int
     thresholds: PeakThresholds | None = None
+    half_side: int = CHIP_CENTRE
 
 
 @dataclass(frozen=True)
@@ -231,7 +233,7 @@ def _not_searched(reason: str) -> _PointMatch:
 
 def _predicted_patch(search: ChipSearch, lon_lat_h: Array, scene_gsd_m: float) -> FloatImage:
     """The scene around a point (3,), in the geometry of its chips, as far as it is searched."""
-    size = 2 * (CHIP_CENTRE + search.radius_px) + 1
+    size = 2 * (search.half_side + search.radius_px) + 1
     positions = chip_positions(search.model, lon_lat_h, search.gsd_m, size)
     return sample_image(search.image, positions, search.gsd_m / scene_gsd_m)
 
@@ -254,7 +256,7 @@ def _match_point(
         scene_gsd_m: ground sampling of the scene at the point, metres.
         options: thresholds.
     """
-    half_side = visible_half_side(patch, CHIP_CENTRE, search.radius_px)
+    half_side = visible_half_side(patch, search.half_side, search.radius_px)
     if half_side == 0:
         peaks = [rejected(missing_reason(patch)) for _ in candidates]
         return peaks, combine_views(peaks, options.agreement_px), False

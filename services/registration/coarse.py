@@ -1,7 +1,8 @@
 """The coarse search of a scene whose model may be far off: few points, far out, and a consensus.
 
-Coarse chips reach far, but few of them fit side by side, and clouds hide each with all its ground. Where
-they agree no better than by chance, more points are searched with the finest chips.
+Few large chips fit into a scene side by side, those that overlap say little more than one, and clouds
+hide each with all its ground. Where they agree no better than by chance, more points are searched with
+the middle of the finest chips.
 """
 
 import math
@@ -35,6 +36,8 @@ from services.types import IntArray
 _TRIES = 2
 """Searches of which one has to agree, and the better one is the last of the summaries: two tries are
 two chances."""
+_SMALL_HALF_SIDE = CHIP_CENTRE // 2
+"""Of the middle of the chips, pixels: four times as many of them fit side by side."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,7 @@ def search_coarsely(context: PointContext, prediction: Prediction) -> Prediction
     tries = [_search(context, prediction, gsd_m, rows)]
     max_false_alarms = options.coarse.max_false_alarms / _TRIES
     if tries[0].consensus.false_alarms > max_false_alarms:
-        tries += _with_more_chips(context, prediction, tries[0].search)
+        tries += _with_smaller_chips(context, prediction)
         tries.sort(key=lambda one: one.consensus.false_alarms, reverse=True)
     context.stages.extend(one.stage for one in tries)
     best = tries[-1]
@@ -99,23 +102,28 @@ def search_coarsely(context: PointContext, prediction: Prediction) -> Prediction
     return Prediction(corrected.model, uncertainty_m)
 
 
-def _with_more_chips(context: PointContext, prediction: Prediction, search: Search) -> list[_Agreement]:
-    """The search of more points with the finest chips, if there are more or finer ones within reach."""
+def _with_smaller_chips(context: PointContext, prediction: Prediction) -> list[_Agreement]:
+    """The search of more points with the middle of the finest chips, if these reach far enough."""
     options, points = context.options, context.points
     gsd_m = float(points.views.gsd_m.min())
-    rows = points_expected(
-        context.scene, points, prediction, gsd_m, count=options.max_points or len(points)
-    )
-    is_finer = CHIP_SIZE * gsd_m < search.chip_side_m
     radius_px = search_radius_px(largest_error_m(prediction.uncertainty_m), gsd_m)
-    if radius_px > options.coarse.max_search_px or not (is_finer or len(rows) > len(search.rows)):
+    if radius_px > options.coarse.max_search_px:
         return []
-    return [_search(context, prediction, gsd_m, rows)]
+    count = options.max_points or len(points)
+    rows = points_expected(context.scene, points, prediction, gsd_m, count=count)
+    return [_search(context, prediction, gsd_m, rows, _SMALL_HALF_SIDE)]
 
 
-def _search(context: PointContext, prediction: Prediction, gsd_m: float, rows: IntArray) -> _Agreement:
-    """What some of the points agree on."""
+def _search(
+    context: PointContext,
+    prediction: Prediction,
+    gsd_m: float,
+    rows: IntArray,
+    half_side: int = CHIP_CENTRE,
+) -> _Agreement:
+    """What some of the points agree on, searched with a part of their chips."""
     scene, options = context.scene, context.options
+    side_m = (2 * half_side + 1) * gsd_m
     error_m = largest_error_m(prediction.uncertainty_m)
     radius_px = search_radius_px(error_m, gsd_m)
     points = context.points.take(rows)
@@ -126,6 +134,7 @@ def _search(context: PointContext, prediction: Prediction, gsd_m: float, rows: I
         gsd_m,
         radius_px,
         thresholds=PeakThresholds(options.coarse.min_score, max_second=1.0),
+        half_side=half_side,
     )
     matches = match_points(chip_search, points, context.chips, options.matching, context.progress)
     consensus = first_consensus(
@@ -134,7 +143,7 @@ def _search(context: PointContext, prediction: Prediction, gsd_m: float, rows: I
         matches.line_sample,
         level_m=gsd_m,
         radius_m=radius_px * gsd_m,
-        side_m=CHIP_SIZE * gsd_m,
+        side_m=side_m,
     )
     stage = summarise(
         "coarse",
@@ -143,10 +152,10 @@ def _search(context: PointContext, prediction: Prediction, gsd_m: float, rows: I
         level_m=gsd_m,
         radius_m=radius_px * gsd_m,
         needed_m=error_m,
-        voters=Voters(matches.line_sample, CHIP_SIZE * gsd_m / scene_gsd_m(scene)),
+        voters=Voters(matches.line_sample, side_m / scene_gsd_m(scene)),
         lon_lat_h=points.lon_lat_h,
     )
-    search = Search(points, rows, matches, consensus.inliers, CHIP_SIZE * gsd_m)
+    search = Search(points, rows, matches, consensus.inliers, side_m)
     return _Agreement(search, consensus, stage)
 
 

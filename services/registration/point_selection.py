@@ -13,8 +13,8 @@ from services.sensors.correction import CorrectedModel, no_correction
 from services.types import Array, ControlPoints, IntArray
 
 MIN_RELATIVE_PROBABILITY = 0.5
-"""Points whose probability of being shown is below this fraction of the best point's are tried only where
-fewer others exist than are tried."""
+"""Points whose probability of being shown is below this fraction of the best point's are tried only
+where fewer others exist than are tried."""
 
 
 def visible_points(scene: Scene, points: ControlPoints) -> IntArray:

@@ -50,12 +50,14 @@ def test_points_that_agree_correct_the_model() -> None:
 
 
 def test_points_whose_chips_show_the_same_ground_are_too_few_to_be_believed() -> None:
-    """Chips of 404 m at points 60 m apart: nine agree, and are hardly more than one."""
+    """Chips of 404 m at points 60 m apart: nine agree, and are hardly more than one, halved or not."""
     of, (points, chips) = scene(OFF_M, SIGMA_M, 700, 700), points_at(lattice(3, 30.0), GSD_M)
     context = point_context(of, points, chips, GSD_M, enough=1)
     with pytest.raises(NoConsensus, match="9 of them within 12 m of each other, which chance explains"):
         search_coarsely(context, predicted(of, points))
-    ((group,),) = (stage.candidates for stage in context.stages)
-    assert group.points == 9
-    np.testing.assert_allclose([group.east_m, group.north_m], OFF_M, atol=GSD_M)
-    assert group.false_alarms > context.options.coarse.max_false_alarms
+    halved, whole = sorted(group.false_alarms for stage in context.stages for group in stage.candidates)
+    assert whole > halved > context.options.coarse.max_false_alarms
+    for stage in context.stages:
+        (group,) = stage.candidates
+        assert group.points == 9
+        np.testing.assert_allclose([group.east_m, group.north_m], OFF_M, atol=GSD_M)

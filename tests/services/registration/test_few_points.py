@@ -50,7 +50,7 @@ def with_coarse_chips(row_col: Array) -> tuple[ControlPoints, MemoryChips]:
     )
 
 
-def test_where_coarse_chips_overlap_too_much_to_be_believed_the_fine_ones_are_searched() -> None:
+def test_where_coarse_chips_overlap_too_much_to_be_believed_smaller_ones_are_searched() -> None:
     """Chips of 808 m in a scene of 1,400 m: all agree, and are hardly more than two."""
     of, (points, chips) = scene(OFF_M, SIGMA_M, 700, 700), with_coarse_chips(around_the_middle(110.0))
     context = point_context(of, points, chips, FINE_M, enough=1)
