@@ -69,6 +69,9 @@ _ALONG_SLOPE = 1.5
 or a scale has 1."""
 _LARGEST_LEAN = 1.0
 """Tangent of the largest angle between the lines of sight of two images of one place."""
+_REFUTES_SIGMAS = 4.0
+"""Residuals refute that heights move the points where they grow with heights otherwise: by so many of
+the standard deviations of that growth, and by more than half of what the heights would explain."""
 
 
 @dataclass(frozen=True)
@@ -244,7 +247,8 @@ def correction_against_height(
 
     The relief of a slope moves points in proportion to their heights where the model is that of another
     view. An affine follows it, so that no residual tells; but beyond the points, and wherever the ground
-    leaves their plane, it is wrong.
+    leaves their plane, it is wrong. Where points leave it, and stay where the correction has them, it is
+    a drift that happens to run up the slope.
 
     Args:
         displacement_px: (n, 2) of the active points from where the model was before registration.
@@ -269,6 +273,7 @@ def correction_against_height(
     by_chance = 200.0 * float(sigma_px * np.linalg.norm(up @ inverse[1:]))
     lean = percent / 100.0 / steepness * gsd_m
     explained = percent >= _ALONG_SLOPE * across and lean <= _LARGEST_LEAN
+    explained &= not _refuted(growth / steepness, misfit_px, height_m - design @ of_height, sigma_px)
     least = max(percent - by_chance, 0.0) if explained else 0.0
     criterion = at_most(name, least, _MOST_WITH_SLOPE, "usable")
     seen = (
@@ -278,6 +283,22 @@ def correction_against_height(
         "another datum or scale"
     )
     return replace(criterion, note="" if criterion.met else seen)
+
+
+def _refuted(slope_px: Array, misfit_px: Array, above_m: Array, sigma_px: float) -> bool:
+    """Whether residuals (n, 2) of points above a plane (n,) show that heights move none by a slope.
+
+    Args:
+        slope_px: (2,) line and sample by which a metre of height would move a point.
+        misfit_px: residuals beside the plane of the displacements.
+        above_m: heights above the plane of the heights.
+        sigma_px: of the residuals, both coordinates together.
+    """
+    weight = float(above_m @ above_m)
+    if weight == 0.0:
+        return False
+    differs = float(np.hypot(*(slope_px - above_m @ misfit_px / weight)))
+    return differs > max(_REFUTES_SIGMAS * sigma_px / np.sqrt(weight), np.hypot(*slope_px) / 2.0)
 
 
 def elsewhere_criterion(

@@ -79,6 +79,34 @@ def test_an_image_that_is_turned_or_scaled_is_not_taken_for_another_view(
     assert judged(at @ np.array(jacobian), at, hillside(at, 10.0)).value == 0.0
 
 
+def rough_hillside(at: Array) -> Array:
+    """Heights of ground that rises by 10 %, with hills of 30 m."""
+    hills_m = 30.0 * np.sin(at[:, 0] / 200.0) * np.cos(at[:, 1] / 170.0)
+    return np.asarray(hillside(at, 10.0) + hills_m)
+
+
+def test_a_drift_up_a_slope_that_hills_beside_it_do_not_follow_is_a_drift() -> None:
+    """The same displacement of the plane, with and without that of the hills."""
+    at = places(np.random.default_rng(10))
+    height_m = rough_hillside(at)
+    design = np.column_stack([np.ones(len(at)), at])
+    plane_m = design @ np.linalg.lstsq(design, height_m, rcond=None)[0]
+    drift = judged(seen_otherwise(plane_m, 6.0), at, height_m)
+    of_another_view = judged(seen_otherwise(height_m, 6.0), at, height_m)
+    assert drift.met
+    assert drift.value == 0.0
+    assert not of_another_view.met
+
+
+def test_hills_too_low_to_be_seen_in_the_residuals_refute_nothing() -> None:
+    at = places(np.random.default_rng(11))
+    design = np.column_stack([np.ones(len(at)), at])
+    height_m = hillside(at, 10.0)
+    plane_m = design @ np.linalg.lstsq(design, height_m, rcond=None)[0]
+    low_m = plane_m + 0.1 * (height_m - plane_m)
+    assert not judged(seen_otherwise(plane_m, 6.0), at, low_m).met
+
+
 def test_level_ground_explains_no_correction() -> None:
     """Its points differ by centimetres: no line of sight leans by as much as they would ask for."""
     rng = np.random.default_rng(3)
