@@ -128,7 +128,7 @@ class RasterImage:
             return ()
         largest = int(np.iinfo(dtype).max)
         bits = self.dataset.tags(band, ns="IMAGE_STRUCTURE").get("NBITS", "")
-        if bits.isdecimal() and len(bits) <= 2:  # a file beside the image may say anything
+        if bits.isdecimal() and len(bits) <= 2 and int(bits):  # a file beside the image may say anything
             largest = min(largest, 2 ** int(bits) - 1)
         stated = self.codes.saturated
         return (largest,) if stated in (None, largest) else (largest, stated)

@@ -256,7 +256,7 @@ def test_twelve_bits_in_sixteen_have_no_largest_value_unless_somebody_states_it(
     assert np.isfinite(open_raster(write(tmp_path / "a.tif", pixels)).read(ALL)).all()
 
 
-@pytest.mark.parametrize("bits", ["99", "9" * 20, "²", ""])
+@pytest.mark.parametrize("bits", ["0", "99", "9" * 20, "²", ""])
 def test_impossible_bits_that_a_file_beside_the_image_states_are_those_of_the_pixels(
     tmp_path: Path, bits: str
 ) -> None:
