@@ -69,9 +69,9 @@ _ALONG_SLOPE = 1.5
 or a scale has 1."""
 _LARGEST_LEAN = 1.0
 """Tangent of the largest angle between the lines of sight of two images of one place."""
-_REFUTES_SIGMAS = 4.0
-"""Residuals refute that heights move the points where they grow with heights otherwise: by so many of
-the standard deviations of that growth, and by more than half of what the heights would explain."""
+_REFUTES_SIGMAS, _HARDLY_GROWS = 4.0, 0.25
+"""Residuals refute that heights move the points where they grow with heights by less than this share of
+what would explain the correction, and differ from it by so many standard deviations of that growth."""
 
 
 @dataclass(frozen=True)
@@ -297,8 +297,9 @@ def _refuted(slope_px: Array, misfit_px: Array, above_m: Array, sigma_px: float)
     weight = float(above_m @ above_m)
     if weight == 0.0:
         return False
-    differs = float(np.hypot(*(slope_px - above_m @ misfit_px / weight)))
-    return differs > max(_REFUTES_SIGMAS * sigma_px / np.sqrt(weight), np.hypot(*slope_px) / 2.0)
+    seen_px = above_m @ misfit_px / weight
+    differs = np.hypot(*(slope_px - seen_px)) > _REFUTES_SIGMAS * sigma_px / np.sqrt(weight)
+    return bool(differs and np.hypot(*seen_px) < _HARDLY_GROWS * np.hypot(*slope_px))
 
 
 def elsewhere_criterion(

@@ -98,6 +98,16 @@ def test_a_drift_up_a_slope_that_hills_beside_it_do_not_follow_is_a_drift() -> N
     assert not of_another_view.met
 
 
+@pytest.mark.parametrize("drift", [0.006, 0.02])
+def test_another_view_that_drifts_up_the_slope_too_is_another_view(drift: float) -> None:
+    """Residuals then grow with the heights by less than would explain all of the correction."""
+    at = places(np.random.default_rng(12))
+    height_m = rough_hillside(at)
+    up = np.array([np.cos(np.radians(30.0)), np.sin(np.radians(30.0))])
+    along = np.array([np.cos(np.radians(80.0)), np.sin(np.radians(80.0))])
+    assert not judged(seen_otherwise(height_m, 6.0) + drift * np.outer(at @ up, along), at, height_m).met
+
+
 def test_hills_too_low_to_be_seen_in_the_residuals_refute_nothing() -> None:
     at = places(np.random.default_rng(11))
     design = np.column_stack([np.ones(len(at)), at])
