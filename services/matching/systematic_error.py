@@ -8,7 +8,7 @@ from services.adjustment.robust import MAD_TO_STD
 from services.matching.shadows import shadow_vector
 from services.types import Acquisition, Array, IntArray, Views
 
-COMMON_SIGMA_PX = 0.05
+COMMON_SIGMA_PX = 0.035
 """Smallest systematic error of a registration, chip pixels: shadows that all turn the same way."""
 
 HEIGHT_SIGMA_PX = 0.1
@@ -29,6 +29,9 @@ MIN_VIEWS_OF_IMAGE = 5
 
 _MEDIAN_VARIANCE = math.pi / 2.0
 """Variance of the median of many normal values, in units of that of their mean."""
+
+IMAGE_SIGMA_PX = 0.019
+"""Offset expected of an image before its measures are seen, chip pixels."""
 
 _PRIOR_FREEDOM = 0.5
 """Weight of the expected offset of an image, in differences of images that show it."""
@@ -88,7 +91,8 @@ def _image_variance_px2(views: Views, row: IntArray, offset: Array, weight: Arra
     all measures has that variance times the sum of `s^2`. An image that looks unlike the scene is
     further off and has a small share: images count in the estimate by their shares.
     Few images show little of it: a prior adds the offset expected without any, and the factor of
-    Student's distribution makes the 90 % region hold what it says.
+    Student's distribution makes the 90 % region hold what it says. The prior counts less the further
+    what is seen exceeds it, down to one difference of images with it.
     """
     point = np.searchsorted(views.start, row, side="right")
     _, point = np.unique(point, return_inverse=True)
@@ -109,9 +113,11 @@ def _image_variance_px2(views: Views, row: IntArray, offset: Array, weight: Arra
     if contrast.any():
         seen_px2 = max(0.0, float(mean_share @ square_px2 / (mean_share @ contrast)))
         freedom = float((mean_share @ contrast) ** 2 / (mean_share**2 @ contrast))
-    prior_px2 = 3.0 * COMMON_SIGMA_PX**2 / _student_factor(2.0 * _PRIOR_FREEDOM)
-    variance_px2 = (_PRIOR_FREEDOM * prior_px2 + freedom * seen_px2) / (_PRIOR_FREEDOM + freedom)
-    factor = _student_factor(2.0 * (_PRIOR_FREEDOM + freedom))
+    prior_px2, prior_freedom = IMAGE_SIGMA_PX**2, _PRIOR_FREEDOM
+    if seen_px2 > prior_px2:
+        prior_freedom = min(max(prior_freedom * prior_px2 / seen_px2, 1.0 - freedom), prior_freedom)
+    variance_px2 = (prior_freedom * prior_px2 + freedom * seen_px2) / (prior_freedom + freedom)
+    factor = _student_factor(2.0 * (prior_freedom + freedom))
     return float(factor * variance_px2 * (mean_share**2).sum())
 
 

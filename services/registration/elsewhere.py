@@ -33,6 +33,9 @@ _MOST = 24
 _RADIUS_PX = 56
 """Search radius, pixels of the chips."""
 _MAX_FALSE_ALARMS = 1e-3
+_MAX_FALSE_ALARMS_FAR = 1e-5
+"""The same of points found far away: what moved or changed each by itself does not move evenly over the
+whole window, as chance is reckoned, but by little more than the narrow search allows."""
 _EXPLAINED = 0.75
 """Misfits that a slope with the height leaves, over those without it, at most."""
 
@@ -251,7 +254,7 @@ def _far_away(
     displacement_m[np.hypot(*displacement_m.T) <= near_m] = np.nan
     voters = Voters(matches.line_sample, CHIP_SIZE * gsd_m / context.gsd_m)
     group = a_contrario_consensus(displacement_m, tolerance_m, _RADIUS_PX * gsd_m, voters)
-    if group.inliers.sum() < 3 or group.false_alarms > _MAX_FALSE_ALARMS:
+    if group.inliers.sum() < 3 or group.false_alarms > _MAX_FALSE_ALARMS_FAR:
         return None
     expected = prediction.model.project(points.lon_lat_h[group.inliers])
     return Elsewhere(
