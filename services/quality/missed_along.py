@@ -18,6 +18,9 @@ _FEWEST = 4
 _BORDERS, _FEWEST_AT_BORDER = 4, 3
 _MOST_ENDS = 400
 """Points at which intervals begin, and at which they end: dense references have thousands."""
+_SAME, _FEWEST_IN_ROW = 0.0005, 4
+"""So many points nearer to one another than this share of the image are a row of a grid, of the same
+lines, or samples: no part of a row is whole lines."""
 _HARDLY_ANY = 0.1
 """Share of the missed points that agree, over that of all, at most."""
 
@@ -25,7 +28,7 @@ _HARDLY_ANY = 0.1
 def missed_along(position: Array, agrees: BoolArray, tried: BoolArray) -> BoolArray:
     """Points (n,) of lines, or of samples, where fewer agree than chance explains.
 
-    The intervals are tried that begin and end with points which do not agree. The chance of one
+    The intervals are tried that begin and end with lines of which no point agrees. The chance of one
     is binomial, times their number, at most 0.01; random orders of the points of real scenes fall below
     this in about one of a thousand cases, because intervals overlap.
 
@@ -37,8 +40,10 @@ def missed_along(position: Array, agrees: BoolArray, tried: BoolArray) -> BoolAr
     missed = np.zeros(len(position), dtype=bool)
     for _ in range(_MOST_GAPS):
         rows = np.flatnonzero(tried & ~missed)
+        if agrees[rows].all():
+            break
         rows = rows[np.argsort(position[rows], kind="stable")]
-        of_interval = _least_likely_interval(agrees[rows])
+        of_interval = _least_likely_interval(agrees[rows], _groups(position[rows]))
         if not len(of_interval):
             break
         missed[rows[of_interval]] = True
@@ -81,22 +86,38 @@ def missed_at_borders(
     return missed
 
 
-def _least_likely_interval(agrees: BoolArray) -> IntArray:
-    """The run of points (n,) in which the fewest agree for chance; none where chance explains all."""
+def _groups(position: Array) -> IntArray:
+    """First of the points (n,), in order, of every row of a grid, or of a single point; and n."""
+    n = len(position)
+    apart = np.diff(position) > _SAME * (position[-1] - position[0])
+    first = np.concatenate([[0], np.flatnonzero(apart) + 1, [n]])
+    in_row = np.repeat(np.diff(first) >= _FEWEST_IN_ROW, np.diff(first))
+    is_first = ~in_row
+    is_first[first[:-1]] = True
+    return np.append(np.flatnonzero(is_first), n)
+
+
+def _least_likely_interval(agrees: BoolArray, group: IntArray) -> IntArray:
+    """The run of points (n,) in which the fewest agree for chance; none where chance explains all.
+
+    Args:
+        agrees: (n,) of the points in order.
+        group: first points of the groups (g,) that are in an interval together, and n.
+    """
     nothing = np.zeros(0, dtype=np.int64)
-    if agrees.all():
-        return nothing
-    fails = np.concatenate([[False], ~agrees, [False]])
-    start = np.flatnonzero(fails[1:-1] & ~fails[:-2])
-    end = np.flatnonzero(fails[1:-1] & ~fails[2:]) + 1
-    step = -(-len(start) // _MOST_ENDS)
-    start, end = start[::step], end[::-step]
     before = np.concatenate([[0], np.cumsum(agrees)])
+    # What hides points here and there leaves some; lost lines leave none but by chance.
+    most = _HARDLY_ANY * agrees.mean()
+    hardly_any = np.diff(before[group]) <= most * np.diff(group)
+    hardly_any = np.concatenate([[False], hardly_any, [False]])
+    start = group[np.flatnonzero(hardly_any[1:-1] & ~hardly_any[:-2])]
+    end = group[np.flatnonzero(hardly_any[1:-1] & ~hardly_any[2:]) + 1]
+    step = -(-len(start) // _MOST_ENDS) or 1
+    start, end = start[::step], end[::-step]
     length = end[None, :] - start[:, None]
     count = before[end][None, :] - before[start][:, None]
     tried = length >= _FEWEST
-    # What hides points here and there leaves some; lost lines leave none but by chance.
-    lost = tried & (count <= _HARDLY_ANY * agrees.mean() * length)
+    lost = tried & (count <= most * length)
     if not lost.any():
         return nothing
     chance = bdtr(np.maximum(count, 0), np.maximum(length, 1), agrees.mean()) * tried.sum()

@@ -60,6 +60,36 @@ def test_where_all_points_agree_or_none_does_no_lines_are_told_from_others(agree
     assert not missed_along(line, np.full(60, agree), np.ones(60, dtype=bool)).any()
 
 
+def rows_of_places(rng: np.random.Generator) -> np.ndarray:
+    """Lines of 30 rows of 30 places, which a correction moved by little."""
+    row = np.linspace(30.0, LINES - 30.0, 30)
+    return np.repeat(row, 30) + rng.normal(0.0, 0.05, 900)
+
+
+def test_a_part_of_the_rows_of_a_grid_is_no_band_of_lines() -> None:
+    """Haze hides the right of six rows."""
+    rng = np.random.default_rng(16)
+    accused = 0
+    for _ in range(100):
+        line, right = rows_of_places(rng), np.tile(np.arange(30) >= 9, 30)
+        hazy = (line > 300.0) & (line < 700.0)
+        agrees = rng.random(900) < np.where(hazy & right, 0.02, 0.6)
+        accused += missed_along(line, agrees, np.ones(900, dtype=bool)).any()
+    assert accused <= 3
+
+
+def test_rows_of_a_grid_that_are_lost_are_found_whole() -> None:
+    rng = np.random.default_rng(17)
+    for _ in range(50):
+        line = rows_of_places(rng)
+        lost = (line > 900.0) & (line < 1100.0)
+        agrees = (rng.random(900) < 0.6) & ~(lost & (rng.random(900) < 0.98))
+        missed = missed_along(line, agrees, np.ones(900, dtype=bool))
+        assert not missed[~lost].any()
+        assert missed.sum() % 30 == 0
+        assert missed[lost].mean() > 0.4
+
+
 def test_two_bands_are_both_found() -> None:
     rng = np.random.default_rng(12)
     line = places(rng, 200)
