@@ -27,7 +27,7 @@ from services.matching.correlate import (
     find_chip,
     rejected,
 )
-from services.matching.radiometry import cloud_mask, gradient_image, patch_statistics
+from services.matching.radiometry import gradient_image, mark_clouds, patch_statistics
 from services.matching.shadows import ShadowShift, shadow_shift
 from services.matching.systematic_error import common_covariance_px2
 from services.matching.view_combination import (
@@ -303,9 +303,7 @@ def _assembled(
     displacement_m = np.column_stack([row_col[:, 1] * search.gsd_m, -row_col[:, 0] * search.gsd_m])
     sigma_m = combined_sigmas_px([match.combination for match in matches]) * search.gsd_m
     reason = np.array([match.combination.reason for match in matches], dtype="<U16")
-    # A point beyond the border of the scene, or in a saturated area, has its own reason.
-    clouded = cloud_mask([match.statistics for match in matches], reason == FOUND)
-    reason[clouded & ~np.isin(reason, ("nodata", "saturated"))] = "cloud"
+    mark_clouds(reason, [match.statistics for match in matches])
     measured = move_metres(points.lon_lat_h, np.column_stack([displacement_m, np.zeros(n)]))
     return PointMatches(
         line_sample=search.model.project(measured),

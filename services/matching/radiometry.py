@@ -88,6 +88,15 @@ def _statistics(pixels: FloatImage) -> Array:
     return out
 
 
+def mark_clouds(reason: np.ndarray, statistics: Sequence[Array]) -> None:
+    """Set the reasons (n,) of points that clouds hide; "" is found. See `cloud_mask`.
+
+    A point beyond the border of the scene, or in a saturated area, keeps its own reason.
+    """
+    clouded = cloud_mask(statistics, reason == "")
+    reason[clouded & ~np.isin(reason, ("nodata", "saturated"))] = "cloud"
+
+
 def cloud_mask(statistics: Sequence[Array], found: BoolArray) -> BoolArray:
     """Which points (n,) clouds hide: not found, and much of their surroundings is bright and smooth.
 

@@ -20,6 +20,7 @@ from services.imagery.source import (
 from services.lines_of_sight import intersect_terrain
 from services.matching.control_points import PointMatches
 from services.matching.correlate import FOUND, CorrelationOptions, find_chip
+from services.matching.radiometry import mark_clouds, patch_statistics
 from services.sensors.base import SensorModel
 from services.terrain import Terrain
 from services.types import (
@@ -159,6 +160,7 @@ def match_places(
     sigma_px = np.full(n, np.nan)
     score = np.full(n, np.nan)
     reason = np.full(n, "", dtype="<U16")
+    statistics = []
     gsds_m = (image_gsds_m(model, places.lon_lat_h) for model in (places.model, reference.model))
     ratios = (factor * np.divide(*gsds_m)).tolist()
     for i, ratio in enumerate(ratios):
@@ -169,12 +171,14 @@ def match_places(
         patch = _level_patch(image, places.cell[i], options.window_px // 2 + radius_px, factor)
         peak = find_chip(low_pass(patch, 1.0 / ratio), chip, options.correlation)
         score[i], reason[i] = peak.score, peak.reason
+        statistics.append(patch_statistics(patch))
         if peak.reason == FOUND:
             line_sample[i] = places.line_sample[i] + peak.row_col * factor
             sigma_px[i] = peak.sigma_px * factor
     derivative = places.model.project_derivative(places.lon_lat_h)[:, :, :2]
     displacement_px = line_sample - places.line_sample
     found = reason == FOUND
+    mark_clouds(reason, statistics)
     return PointMatches(
         line_sample=line_sample,
         displacement_m=np.asarray(

@@ -28,8 +28,8 @@ from services.types import Array, BoolArray, IntArray
 
 _FEWEST = 5
 """Points that were not found, from which on they are searched again."""
-_MOST = 24
-"""Points that are searched again, well spread."""
+_MOST, _MOST_SHARE = 24, 0.25
+"""Points that are searched again, well spread: so many, or this share of them where it is more."""
 _RADIUS_PX = 56
 """Search radius, pixels of the chips."""
 _MAX_FALSE_ALARMS = 1e-3
@@ -274,8 +274,9 @@ def _missed(search: Search) -> BoolArray:
 
 
 def _spread(context: PointContext, prediction: Prediction, rows: IntArray) -> IntArray:
-    """At most `_MOST` of the rows of points, well spread."""
-    if len(rows) <= _MOST:
+    """Those of the rows of points that are searched again, well spread."""
+    count = max(_MOST, int(_MOST_SHARE * len(rows)))
+    if len(rows) <= count:
         return rows
     points = context.points.take(rows)
     best = spread_over_image(
@@ -283,6 +284,6 @@ def _spread(context: PointContext, prediction: Prediction, rows: IntArray) -> In
         points.lon_lat_h[:, 2],
         points.saliency * points.health,
         context.scene.image.shape,
-        _MOST,
+        count,
     )
     return np.asarray(np.sort(rows[best]))

@@ -9,7 +9,13 @@ from services.conventions import CHIP_SIZE, MAX_ERROR_SIGMAS
 from services.errors import ComputationError, CoverageError, NoConsensus
 from services.imagery.line_breaks import scene_breaks
 from services.imagery.scene import Scene, scene_centre, scene_gsd_m
-from services.imagery.source import ImageSource, ReducedImage, image_gsds_m, reduce_image
+from services.imagery.source import (
+    CachedImage,
+    ImageSource,
+    ReducedImage,
+    image_gsds_m,
+    reduce_image,
+)
 from services.matching.consensus import Voters
 from services.matching.predict import in_image
 from services.matching.reference_image import (
@@ -20,7 +26,8 @@ from services.matching.reference_image import (
     visible_places,
 )
 from services.quality.stability import image_places
-from services.registration.context import Prediction, RegistrationContext, SearchStage
+from services.registration.context import PointContext, Prediction, RegistrationContext, SearchStage
+from services.registration.elsewhere import adjust_with_places
 from services.registration.far import search_far
 from services.registration.on_points import Registration, build_registration
 from services.registration.options import RegistrationOptions
@@ -134,7 +141,26 @@ def register_on_reference(
             break
     if options.adjustment.bends:
         adjustment = adjust_search(scene, search, options.adjustment)
-    return build_registration(context, search.points, search, adjustment)
+    of_places = _with_chips(context, search)
+    search, adjustment, elsewhere = adjust_with_places(of_places, search, adjustment)
+    return build_registration(context, search.points, search, adjustment, elsewhere)
+
+
+def _with_chips(context: _ReferenceContext, search: Search) -> PointContext:
+    """The places of a search as points with chips of the finest level, to be searched farther out."""
+    ground, reference = search.points.lon_lat_h, context.reference
+    gsd_m = context.gsd_m * context.finest_factor
+    return PointContext(
+        scene=context.scene,
+        options=context.options,
+        progress=context.progress,
+        stages=context.stages,
+        breaks=context.breaks,
+        points=reference_points(ground, reference, gsd_m),
+        chips=ReferenceChips(reference, ground, gsd_m),
+        image=CachedImage(context.scene.image),
+        fine_gsd_m=gsd_m,
+    )
 
 
 def _first_level(context: _ReferenceContext) -> _Level:

@@ -72,10 +72,15 @@ def registered() -> Registration:
     return register_on_reference(spoiled_view().as_scene(SIGMA_M), reference(), OPTIONS)
 
 
+def shown_places() -> np.ndarray:
+    """Places (144, 2) of the image."""
+    axis = np.linspace(60.0, 640.0, 12)
+    return np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+
+
 def error_px(registration: Registration) -> np.ndarray:
     """Errors (n, 2) of the model at the ground that the image really shows."""
-    axis = np.linspace(60.0, 640.0, 12)
-    shown = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    shown = shown_places()
     return registration.model.project(true_ground(spoiled_view(), world(), shown)) - shown
 
 
@@ -88,9 +93,8 @@ def test_a_scene_forty_metres_off_is_brought_onto_the_reference() -> None:
 
 
 def test_the_stated_accuracy_covers_the_error() -> None:
-    axis = np.linspace(60.0, 640.0, 12)
-    shown = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
-    variance = np.diagonal(registered().adjustment.covariance_at(shown), axis1=1, axis2=2)
+    covariance = registered().adjustment.covariance_at(shown_places())
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
     assert (error_px(registered()) ** 2 / variance).mean() < 1.5
 
 
@@ -207,3 +211,33 @@ def test_a_reference_that_shows_something_else_is_not_believed() -> None:
 def test_windows_without_a_centre_are_refused() -> None:
     with pytest.raises(InputError, match="window_px: 40 given"):
         ReferenceMatchingOptions(window_px=40)
+
+
+def with_pixels(pixels: np.ndarray) -> Scene:
+    """The spoiled view with other pixels."""
+    return replace(spoiled_view().as_scene(SIGMA_M), image=ArrayImage(pixels.astype(np.float32)))
+
+
+def test_ground_that_moved_farther_than_the_last_search_is_named() -> None:
+    """A quarter of the scene shows its ground 25 pixels aside."""
+    pixels = spoiled_view().image.pixels.copy()
+    pixels[150:500, 200:550] = pixels[150:500, 225:575].copy()
+    result = register_on_reference(with_pixels(pixels), reference(), OPTIONS)
+    assert result.qualification.verdict != "good"
+    (named,) = (c for c in result.qualification.criteria if c.name == "points_elsewhere")
+    assert not named.met
+    beside = error_px(result)[shown_places()[:, 0] > 520.0]
+    assert np.sqrt((beside**2).sum(axis=1).mean()) < 3.0 * ERROR_ALLOWED_PX
+
+
+def test_clouds_hide_lines_of_a_scene_but_lose_none() -> None:
+    pixels = spoiled_view().image.pixels.copy()
+    line, sample = np.indices(pixels.shape)
+    border = 40.0 * np.sin(sample / 40.0)
+    pixels[np.abs(line - 335.0 + border) < 90.0] = 1.5 * np.quantile(pixels, 0.999)
+    result = register_on_reference(with_pixels(pixels), reference(), OPTIONS)
+    under = np.abs(result.measures.predicted[:, 0] - 335.0) < 50.0
+    assert (result.measures.reason[under] == "cloud").mean() > 0.9
+    assert (result.measures.reason[~under] == "cloud").mean() < 0.5
+    told = [c.name for c in result.qualification.criteria if not c.met]
+    assert "missed_along_lines" not in told
