@@ -70,7 +70,8 @@ class QualificationOptions:
             displacement, as a share of the active points. A scene has one displacement, not two.
         usable_active_points: smallest number of active points.
         usable_active_of_few: smallest ratio of active to matched points where fewer points are active
-            than a good registration has: part of a few points agree on a wrong correction too.
+            than a good registration has, or where they scatter by more than one allows: part of a few
+            points, and of points that hardly agree, agree on a wrong correction too.
         coverage_cells: cells of the coverage along each side of the image.
         grid: nodes of the predicted accuracy along each side of the image.
         draws: number of repeated adjustments in the stability test.
@@ -89,7 +90,7 @@ class QualificationOptions:
     good_unit_weight: float = 3.0
     good_second_consensus_share: float = 0.3
     usable_active_points: int = 6
-    usable_active_of_few: float = 0.7
+    usable_active_of_few: float = 0.75
     usable_residual_std_px: float = 2.0
     usable_displacement_px: float = 2.0
     usable_displacement_m: float = 0.9
@@ -362,12 +363,7 @@ def _of_fit(scene: AdjustedScene, predicted_px: float) -> list[Criterion]:
     off = ~(np.hypot(*misfit_px.T) <= predicted_px)
     return [
         *structures,
-        correction_against_height(
-            (measures.line_sample - measures.predicted)[measures.active],
-            measures.predicted[measures.active],
-            measures.lon_lat_h[measures.active, 2],
-            scene.gsd_m,
-        ),
+        _against_slope(scene),
         *_behind_breaks(scene),
         missed_criterion(
             "lines",
@@ -389,6 +385,21 @@ def _of_fit(scene: AdjustedScene, predicted_px: float) -> list[Criterion]:
         ),
         elsewhere_criterion(scene.elsewhere, expected, measures.active, scene.shape),
     ]
+
+
+def _against_slope(scene: AdjustedScene) -> Criterion:
+    """The criterion on a correction that grows up the slope of the ground.
+
+    Steps between lines are no growth: where they are followed, the affine part beside them counts.
+    """
+    measures, adjustment = scene.measures, scene.adjustment
+    predicted = measures.predicted[measures.active]
+    measured = measures.line_sample[measures.active]
+    if any(one.is_step for one in adjustment.components):
+        affine = replace(adjustment.correction, displacement=None)
+        measured = affine.apply(predicted) + measures.residual_px[measures.active]
+    height_m = measures.lon_lat_h[measures.active, 2]
+    return correction_against_height(measured - predicted, predicted, height_m, scene.gsd_m)
 
 
 def _whole(scene: AdjustedScene, expected: Array) -> BoolArray:
@@ -437,7 +448,8 @@ def _criteria(
     usable_displacement_px = max(o.usable_displacement_px * control_px, o.usable_displacement_m / gsd_m)
     good_displacement_px = max(o.good_displacement_px, o.good_displacement_m / gsd_m)
     usable_residual_px = o.usable_residual_std_px * control_px
-    few = o.usable_active_of_few > 0.0 and f.active_points < o.good_active_points
+    scattered = f.residual_std_px > o.good_residual_std_px
+    few = o.usable_active_of_few > 0.0 and (f.active_points < o.good_active_points or scattered)
     return (
         at_least("active_points", f.active_points, o.good_active_points, "good"),
         at_least("coverage_percent", f.coverage_percent, o.good_coverage_percent, "good"),

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from services.adjustment.displacement_components import Component
 from services.quality.criteria import Criterion
 from services.quality.lack_of_fit import correction_against_height
 from services.quality.qualification import QualificationOptions, qualify
@@ -176,3 +177,21 @@ def test_the_registration_of_a_hillside_with_the_model_of_another_view_does_not_
         assert result.verdict == verdict
         unmet = {c.name for c in result.criteria if not c.met}
         assert unmet == ({"correction_against_height"} if verdict == "failed" else set())
+
+
+def test_repeated_lines_on_a_hillside_are_no_other_view(registered: Callable[..., Registered]) -> None:
+    """Sixty lines that are repeated in the middle displace what lies behind them up the slope."""
+    scene = registered()
+    measures = scene.measures
+    at = measures.line_sample
+    height_m = hillside(at, 10.0, towards_deg=0.0)
+    lon_lat_h = np.column_stack([measures.lon_lat_h[:, :2], height_m])
+    middle = np.nanmedian(at[:, 0])
+    behind = at[:, 0] > middle
+    seen = replace(measures, predicted=at - 60.0 * behind[:, None] * [1.0, 0.0], lon_lat_h=lon_lat_h)
+    followed = Component("break", 1.0, float(middle), np.full(2, 1e4))
+    for components, verdict in (((), "failed"), ((followed,), "good")):
+        adjustment = replace(scene.adjustment, components=components)
+        registration = replace(scene, measures=seen, adjustment=adjustment)
+        result = qualify(registration.adjusted(), QualificationOptions(), np.random.default_rng(3))
+        assert result.verdict == verdict

@@ -292,6 +292,15 @@ def test_many_points_are_usable_although_many_others_disagree(
     assert ("active_of_matched", "usable") in failed(qualified(scene, many))
 
 
+def test_of_many_points_that_scatter_most_must_agree_too(registered: Callable[..., Registered]) -> None:
+    """Where many are left out of points that hardly agree, those left may agree by chance."""
+    few_agree = registered(n=90, lost=0, wrong=35, noise_px=1.5)
+    assert ("active_of_matched", "usable") in failed(qualified(few_agree))
+    most_agree = registered(n=90, lost=0, wrong=10, noise_px=1.5)
+    assert ("residual_std_px", "good") in failed(qualified(most_agree))
+    assert ("active_of_matched", "usable") not in failed(qualified(most_agree))
+
+
 def test_what_points_of_three_metres_are_known_to_give_is_good(registered):
     """SRP: scenes of 0.5 m on points of 3 m CE90: corners within 0.3 m, CE90 of 0.4 m."""
     points_px = 3.0 / CIRCULAR_CE90 / GSD_M
