@@ -53,7 +53,7 @@ _WHY_MISSED = {
 _LARGE_PART = 0.4
 """Share of the image to which points that agree elsewhere are nearest, beyond which neither place is the
 scene's."""
-_AMONG, _AS_MANY = 0.3, 0.1
+_AMONG, _AS_MANY = 0.15, 0.1
 """Share of the active points between points that agree elsewhere, and number of these over the active
 ones, beyond which the image has two places. A pattern of the ground displaces a few; of those that were
 missed, 24 are searched again."""

@@ -107,6 +107,19 @@ def test_detectors_that_alternate_leave_no_place_that_is_the_scenes(seed: int) -
     assert "detectors that alternate" in criterion.note
 
 
+def test_detectors_that_alternate_are_told_by_few_of_their_points() -> None:
+    """Points of the middle of the image: those at its sides lie beside the points elsewhere."""
+    line_sample = np.random.default_rng(3).uniform(0.0, 999.0, (160, 2))
+    beside = np.isin(line_sample[:, 1] // 100, [2, 5, 6]) & (np.arange(160) % 4 != 0)
+    group = Elsewhere(np.flatnonzero(beside), np.array([4.0, -6.0]), 5.0, 1e-9)
+    active = ~np.isin(line_sample[:, 1] // 100, [2, 5, 6])
+    hull = (line_sample[:, 1] > 200.0) & (line_sample[:, 1] < 700.0) & active
+    assert 0.2 < hull.sum() / active.sum() < 0.3
+    criterion = elsewhere_criterion(group, line_sample, active, (1000, 1000))
+    assert (criterion.met, criterion.needed_for) == (False, "usable")
+    assert "detectors that alternate" in criterion.note
+
+
 @pytest.mark.parametrize(("few", "others", "needed_for"), [(3, 12, "good"), (12, 60, "usable")])
 def test_few_points_of_some_samples_are_of_them_by_chance(
     few: int, others: int, needed_for: str
