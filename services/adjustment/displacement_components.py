@@ -22,14 +22,22 @@ from scipy.special import eval_legendre
 from services.adjustment.structure import ALONG_AXES, Family, Residuals, Structure, structures
 from services.types import Array, IntArray
 
-Along = Literal["lines", "samples", "image"]
-"""Of which a displacement is a function: of the line, of the sample, of both."""
-_AXES: dict[Along, slice] = {"lines": slice(0, 1), "samples": slice(1, 2), "image": slice(0, 2)}
+Along = Literal["lines", "samples", "swath", "image"]
+"""Of which a displacement is a function: of the line; of the sample; of the line, in proportion to the
+distance from the middle of the swath, as yaw and scale displace; of both."""
+_AXES: dict[Along, slice] = {
+    "lines": slice(0, 1),
+    "samples": slice(1, 2),
+    "swath": slice(0, 1),
+    "image": slice(0, 2),
+}
 _OF_SCANNED: dict[Along, tuple[Family, ...]] = {
     "lines": ("lines", "steps"),
     "samples": ("samples", "seams"),
+    "swath": ("image",),
 }
-_OF_ORTHO: dict[Along, tuple[Family, ...]] = {"image": (*ALONG_AXES, "image")}
+_FAMILIES: tuple[Family, ...] = (*ALONG_AXES, "image")
+_OF_ORTHO: dict[Along, tuple[Family, ...]] = {"image": _FAMILIES}
 """Structures that components of images that were scanned, and of ortho-images, may explain."""
 
 Kind = Literal["smooth", "period", "step", "break", "quadratic", "cubic"]
@@ -57,6 +65,7 @@ _RATIOS = np.concatenate([[0.0], np.geomspace(0.03, 3000.0, 21)])
 _LENGTHS: dict[Along, tuple[float, ...]] = {
     "lines": (0.04, 0.08, 0.15, 0.3, 0.6, 1.2),
     "samples": (0.6, 1.2),
+    "swath": (0.3, 0.6, 1.2),
     "image": (0.08, 0.15, 0.3, 0.6, 1.2),
 }
 """Correlation lengths of smooth components, extents of the points along the axis.
@@ -85,11 +94,12 @@ class Component:
             the image are "quadratic" or "cubic".
         length_px: over which it is correlated; of a step, the width of the gap that holds it; of a bend,
             half the side of the image.
-        at_px: period; first line, or sample, of the gap that holds a step; middle of a bend.
+        at_px: period; first line, or sample, of the gap that holds a step; middle of a bend; middle of
+            the swath.
         variance_px2: (2,) of line and sample, as chips show it, if the stated variances of the measures
             are true: what these are off by, it is off by, too.
         seen: share of the amplitude that chips show, which average over their pixels.
-        along: lines, samples, or both.
+        along: what it is a function of.
     """
 
     kind: Kind
@@ -126,6 +136,12 @@ class Component:
         if self.is_step:
             behind_px = line_sample[..., self.axes.start] - self.at_px
             return np.clip(behind_px / self.length_px, 0.0, 1.0)
+        return self._lever(line_sample) ** 2
+
+    def _lever(self, line_sample: Array) -> Array:
+        """Factor (...) at positions (..., 2): across the swath, 0 in its middle and -1 at sample 0."""
+        if self.along == "swath":
+            return line_sample[..., 1] / self.at_px - 1.0
         return np.ones(line_sample.shape[:-1])
 
     def correlation(self, first: Array, second: Array) -> Array:
@@ -136,6 +152,7 @@ class Component:
             return np.minimum(self.share(first)[:, None], self.share(second)[None, :])
         apart = first[:, None, self.axes] - second[None, :, self.axes]
         smooth = np.exp(-0.5 * (apart**2).sum(axis=2) / self.length_px**2)
+        smooth *= np.outer(self._lever(first), self._lever(second))
         if self.kind == "smooth":
             return np.asarray(smooth)
         return np.asarray(smooth * np.cos(2.0 * np.pi * apart[:, :, 0] / self.at_px))
@@ -185,10 +202,9 @@ def likeliest_components(
     """
     residuals = beside_breaks(residuals, known)
     followed_by = _OF_SCANNED if scanned else _OF_ORTHO
-    families = ALONG_AXES if scanned else _OF_ORTHO["image"]
     components: list[Component] = []
     told = 0.0
-    affine = found = structures(residuals, families)
+    affine = found = structures(residuals, _FAMILIES)
     while True:
         clearest = min(found, key=lambda one: one.chance)
         if clearest.chance > MAX_CHANCE or len(components) == _MOST_WITH_SEAMS:
@@ -206,7 +222,7 @@ def likeliest_components(
             break
         told += best.log_evidence
         components = _again(residuals, [*components, best.component])
-        found = structures(beyond(residuals, components), families)
+        found = structures(beyond(residuals, components), _FAMILIES)
     if components:
         if scanned:
             explained = told <= _LEAST_EVIDENCE + _of_shared_errors(residuals, extent_px)
@@ -331,7 +347,7 @@ def _candidates(
         shown = [one for one in found if one.family in families]
         if min(one.chance for one in shown) <= MAX_CHANCE:
             candidates += _smooth(residuals, along)
-            if along != "image":
+            if along in ("lines", "samples"):
                 candidates += _sharp(residuals, shown, along)
     return candidates
 
@@ -343,8 +359,10 @@ def _smooth(residuals: Residuals, along: Along) -> list[Component]:
     extent = max(float(np.ptp(position, axis=0).max()), 1e-9)
     lengths = [length * extent for length in _LENGTHS[along] if length * extent >= 0.5 * side]
     seen = [(1.0 + (side / length) ** 2 / 12.0) ** (-0.5 * position.shape[1]) for length in lengths]
+    middle = float(np.mean([residuals.line_sample[:, 1].min(), residuals.line_sample[:, 1].max()]))
+    at_px = max(middle, 1.0) if along == "swath" else np.nan
     return [
-        Component("smooth", length, np.nan, np.ones(2), part, along)
+        Component("smooth", length, at_px, np.ones(2), part, along)
         for length, part in zip(lengths, seen, strict=True)
     ]
 

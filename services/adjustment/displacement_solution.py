@@ -31,6 +31,7 @@ _MOST_NODES_OF_BOTH = 65
 _WHERE: dict[Along, tuple[slice, slice]] = {
     "lines": (slice(None), slice(1)),
     "samples": (slice(1), slice(None)),
+    "swath": (slice(None), slice(None)),
     "image": (slice(None), slice(None)),
 }
 """Nodes that differ for components along the lines, along the samples, and along both."""
@@ -203,13 +204,13 @@ def _nodes(
         last = shape[axis] - 1.0
         low = float(min(0.0, place.min(), -moved.max()))
         high = float(max(last, place.max(), last - moved.min()))
-        along = [one for one in components if axis in range(2)[one.axes]]
+        along = [one for one in components if axis in range(2)[one.axes] or one.along == "swath"]
         if any(one.along == "image" for one in along):
             most = _MOST_NODES_OF_BOTH
         steps = [
             one.at_px / _NODES_A_PERIOD if one.kind == "period" else one.length_px / _NODES_A_LENGTH
             for one in along
-            if not one.is_step
+            if not one.is_step and axis in range(2)[one.axes]
         ]
         gaps = [
             np.linspace(one.at_px, one.at_px + one.length_px, _NODES_A_GAP)

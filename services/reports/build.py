@@ -184,4 +184,6 @@ def _component_in_words(component: Component, adjustment: SceneAdjustment) -> st
         return f"a step at about line {line:.0f}, where the pixels show lost or repeated lines"
     if component.kind == "period":
         return f"jitter with a period of {component.at_px:.0f} {component.along}"
+    if component.along == "swath":
+        return f"lines that turn or grow, changing over {component.length_px:.0f} lines"
     return f"a bend that changes over {component.length_px:.0f} {component.along}"

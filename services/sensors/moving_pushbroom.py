@@ -21,6 +21,8 @@ _SLOPES = 0.5, 2.0
 were lost somewhere in a gap. Faster jumps would show a line twice, or not at all."""
 _LEAST_PX = 1e-9
 """What is left of a sum of numbers below it is no motion."""
+_BESIDE_PX = 0.05
+"""Displacement that is neither one of lines nor one of samples, which turns and looks do not follow."""
 _ROLL_PITCH = [TERMS.index(name) for name in ("roll", "pitch")]
 
 
@@ -48,11 +50,11 @@ def attitude_motion(model: PushbroomModel, correction: ImageCorrection) -> Attit
         correction: of its image, see `moving_model`.
 
     Returns:
-        None where the lines stay, or where they jump.
+        None where the lines stay, or where no turn by roll and pitch explains how they move.
     """
     along_lines, _ = _separated(correction)
     grid = correction.displacement
-    if grid is None or not along_lines.any():
+    if grid is None or not along_lines.any() or not _is_sum(correction):
         return None
     centre = np.full(len(grid.line), (model.image_shape[1] - 1.0) / 2.0)
     expected = np.column_stack([grid.line, centre])
@@ -76,8 +78,10 @@ def moving_model(model: PushbroomModel, correction: ImageCorrection) -> Pushbroo
             part says in which lines, and so when, the sensor moved.
 
     Returns:
-        None where the image jumps, so that no motion of the sensor explains it.
+        None where the image jumps, or lines turn, so that no such motion of the sensor explains it.
     """
+    if not _is_sum(correction):
+        return None
     along_lines, along_samples = _separated(correction)
     attitude, look = model.attitude, model.look
     if along_lines.any():
@@ -112,6 +116,16 @@ def _separated(correction: ImageCorrection) -> tuple[Array, Array]:
     along_lines[np.abs(along_lines) < _LEAST_PX] = 0.0
     along_samples[np.abs(along_samples) < _LEAST_PX] = 0.0
     return along_lines, along_samples
+
+
+def _is_sum(correction: ImageCorrection) -> bool:
+    """Whether lines move as wholes, and samples: lines that turn, as by yaw, do not."""
+    grid = correction.displacement
+    if grid is None:
+        return True
+    along_lines, along_samples = _separated(correction)
+    beside_px = grid.displacement_px - along_lines[:, None] - along_samples[None]
+    return bool(np.abs(beside_px).max() <= _BESIDE_PX)
 
 
 def _goes_on(nodes: Array, moved: Array) -> bool:

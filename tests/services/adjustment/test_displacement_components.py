@@ -126,6 +126,21 @@ def seam(at: float, size_px: tuple[float, float]) -> Motion:
     return lambda place: (place[:, 1] > at)[:, None] * list(size_px)
 
 
+def yaw(size_px: float, period: float, scale_px: float = 0.0) -> Motion:
+    """Lines that turn and grow with time, in proportion to the distance from the middle of the swath."""
+
+    def motion(place: Array) -> Array:
+        turned = np.sin(2.0 * np.pi * place[:, 0] / period) * (2.0 * place[:, 1] / SHAPE[1] - 1.0)
+        return turned[:, None] * [size_px, scale_px]
+
+    return motion
+
+
+def diagonal(size_px: float) -> Motion:
+    """A bow across the image from corner to corner."""
+    return lambda place: size_px * ((place / SHAPE).sum(axis=1) - 1.0)[:, None] ** 2 * [0.5, 1.0]
+
+
 def both(*motions: Motion) -> Motion:
     return lambda place: np.sum([one(place) for one in motions], axis=0)
 
@@ -143,6 +158,10 @@ MOTIONS = {
     "large bow over samples": bow(8.0, axis=1),
     "distortion of the optics": bow(3.0, axis=1, degree=3),
     "bows over both": both(bow(6.0), bow(3.0, axis=1)),
+    "yaw that drifts": both(yaw(8.0, 12_000.0), bow(2.0)),
+    "yaw that swings": yaw(4.0, 4_000.0),
+    "scale that changes": yaw(0.0, 6_000.0, 5.0),
+    "diagonal bow": diagonal(5.0),
     "jitter and a bow over samples": both(jitter(600.0, (1.0, 2.0)), bow(4.0, axis=1)),
 }
 

@@ -144,3 +144,14 @@ def test_no_motion_changes_nothing() -> None:
     assert still is not None
     ground = ground_in(model)
     np.testing.assert_allclose(still.project(ground), model.project(ground), atol=1e-6)
+
+
+def test_lines_that_turn_are_no_roll_or_pitch() -> None:
+    """Yaw moves the ends of lines in opposite directions, which no line as a whole does."""
+    across = 2.0 * SAMPLES / SHAPE[1] - 1.0
+    turned = waves((900.0, 900.0), (2.0, 0.0))[:, None, :] * across[None, :, None]
+    still = moved(np.zeros((len(LINES), 2)))
+    assert still.displacement is not None
+    correction = replace(still, displacement=replace(still.displacement, displacement_px=turned))
+    assert moving_model(a_model(), correction) is None
+    assert attitude_motion(a_model(), correction) is None
