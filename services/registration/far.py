@@ -17,6 +17,7 @@ from services.matching.control_points import chip_pixels
 from services.matching.multi_image import nearly_whole
 from services.matching.radiometry import gradient_image
 from services.matching.view_selection import select_views
+from services.registration.another_view import another_view
 from services.registration.context import (
     Candidate,
     NotFound,
@@ -174,7 +175,14 @@ def search_far(
             break
     stage = _summary(scene, plan, consensus, reason)
     context.stages.append(stage)
-    check_consensus(stage, consensus, reason, scene, options.max_false_alarms / 2.0)
+    check_consensus(
+        stage,
+        consensus,
+        reason,
+        scene,
+        options.max_false_alarms / 2.0,
+        of_another=lambda: another_view(scene, stage, tried.lon_lat_h, predicted, measured),
+    )
     correction = no_correction(scene.image.shape)
     correction.parameters[:, 0] = consensus.displacement
     uncertainty_m = np.hypot(

@@ -16,6 +16,7 @@ from services.quality.frames import shared_frame
 from services.quality.lack_of_fit import Elsewhere
 from services.quality.qualification import Qualification, qualify
 from services.quality.stability import AdjustedScene
+from services.registration.another_view import another_view
 from services.registration.chip_selection import fine_gsd_m
 from services.registration.coarse import needs_coarse_search, search_coarsely
 from services.registration.context import PointContext, Prediction, RegistrationContext, SearchStage
@@ -176,8 +177,17 @@ def search_scene(
 def _match(context: PointContext, prediction: Prediction, rows: IntArray) -> Search:
     """A search of some of the points with the fine chips, of which enough have to agree."""
     search, tolerance_px = search_near(context, prediction, rows)
-    reason, min_points = search.matches.reason, context.options.adjustment.min_points
-    check_inliers(context.stages[-1], tolerance_px, reason, context.scene, min_points)
+    scene, stage = context.scene, context.stages[-1]
+    lon_lat_h, measured = search.points.lon_lat_h, search.matches.line_sample
+    predicted = prediction.model.project(lon_lat_h)
+    check_inliers(
+        stage,
+        tolerance_px,
+        search.matches.reason,
+        scene,
+        context.options.adjustment.min_points,
+        of_another=lambda: another_view(scene, stage, lon_lat_h, predicted, measured),
+    )
     return search
 
 

@@ -158,7 +158,13 @@ def select_inliers(
 
 
 def check_inliers(
-    stage: SearchStage, tolerance_px: float, reason: np.ndarray, scene: Scene, min_points: int
+    stage: SearchStage,
+    tolerance_px: float,
+    reason: np.ndarray,
+    scene: Scene,
+    min_points: int,
+    *,
+    of_another: Callable[[], str] = lambda: "",
 ) -> None:
     """Refuse a search of whose points too few agree.
 
@@ -168,6 +174,7 @@ def check_inliers(
         reason: (k,) why points were not found.
         scene: that was searched.
         min_points: smallest number of inliers.
+        of_another: what the matches tell of another model, where they are refused; "" for nothing.
 
     Raises:
         NotEnoughPoints: fewer points were found than are needed.
@@ -185,7 +192,7 @@ def check_inliers(
         raise NoConsensus(
             f"{stage.matched} points found of {stage.tried} tried within {stage.search_radius_m:.1f} m, "
             f"but {agreeing} of them agree within {tolerance_px:.1f} px, {min_points} needed; "
-            + next_step(stage, scene.sigma_m)
+            + (of_another() or next_step(stage, scene.sigma_m))
         )
 
 
