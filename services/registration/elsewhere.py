@@ -10,7 +10,12 @@ import numpy as np
 
 from services.adjustment.image_correction import SceneAdjustment
 from services.conventions import CHIP_SIZE
-from services.matching.consensus import Voters, a_contrario_consensus, consensus_tolerance_px
+from services.matching.consensus import (
+    Consensus,
+    Voters,
+    a_contrario_consensus,
+    consensus_tolerance_px,
+)
 from services.matching.control_points import ChipSearch, PointMatches, match_points, with_matches
 from services.matching.height_consensus import height_consensus
 from services.matching.predict import spread_over_image
@@ -36,6 +41,12 @@ _MAX_FALSE_ALARMS = 1e-3
 _MAX_FALSE_ALARMS_FAR = 1e-5
 """The same of points found far away: what moved or changed each by itself does not move evenly over the
 whole window, as chance is reckoned, but by little more than the narrow search allows."""
+_BEYOND_ERRORS, _OF_TALL = 6.0, 2.0
+"""Heights above the ground that no error explains, standard deviations; and how near such points must
+lie to where their heights move them, scatter of the active ones."""
+_CLEARLY, _ABOUT = 4.0, 0.5
+"""Standard deviations by which active points have to move with their heights, and by which share of
+what tall points do they may differ."""
 _EXPLAINED = 0.75
 """Misfits that a slope with the height leaves, over those without it, at most."""
 
@@ -214,16 +225,14 @@ def _as_heights_move(
     reach_px = np.full(len(place), _RADIUS_PX * context.fine_gsd_m / context.gsd_m)
     reach_px[: len(found)] = max(float(np.abs(misfit_px[: len(found)]).max()), tolerance_px)
     group = height_consensus(misfit_px, above_m, tolerance_px, reach_px)
-    members = np.flatnonzero(group.inliers)
-    if group.false_alarms > _MAX_FALSE_ALARMS:
-        return None
-    if len(members) < _FEWEST:
-        # Few lie high enough: the others must agree better, too.
-        others = np.isfinite(misfit_px).all(axis=1) & ~group.inliers
-        without = np.median(np.hypot(*misfit_px[others].T))
-        left_px = misfit_px[others] - above_m[others, None] * group.displacement
-        if np.median(np.hypot(*left_px.T)) > _EXPLAINED * without:
+    if not _is_of_all(group, misfit_px, above_m):
+        # Near the ground, errors of the heights displace points as well.
+        tall = np.abs(above_m) > _BEYOND_ERRORS * np.sqrt(context.points.covariance_m2[place, 2, 2])
+        of_tall_px = np.where(tall[:, None], misfit_px, np.nan)
+        group = height_consensus(of_tall_px, above_m, _OF_TALL * rms_px, reach_px)
+        if not _is_of_active(group, misfit_px[active], above_m[active], rms_px):
             return None
+    members = np.flatnonzero(group.inliers)
     displacement_px = np.median(misfit_px[members], axis=0)
     return Elsewhere(
         rows=place[members],
@@ -233,6 +242,29 @@ def _as_heights_move(
         slope_px=group.displacement,
         farthest_px=float(np.hypot(*misfit_px[members].T).max()),
     )
+
+
+def _is_of_all(group: Consensus, misfit_px: Array, above_m: Array) -> bool:
+    """Whether points move with their heights beyond chance, and where they are few, the others, too."""
+    if group.false_alarms > _MAX_FALSE_ALARMS:
+        return False
+    if group.inliers.sum() >= _FEWEST:
+        return True
+    others = np.isfinite(misfit_px).all(axis=1) & ~group.inliers
+    without = np.median(np.hypot(*misfit_px[others].T))
+    left_px = misfit_px[others] - above_m[others, None] * group.displacement
+    return bool(np.median(np.hypot(*left_px.T)) <= _EXPLAINED * without)
+
+
+def _is_of_active(group: Consensus, misfit_px: Array, above_m: Array, rms_px: float) -> bool:
+    """Whether tall points move with their heights beyond chance, and active ones (n,) about as much."""
+    weight = float(above_m @ above_m)
+    if group.false_alarms > _MAX_FALSE_ALARMS or weight == 0.0:
+        return False
+    slope_px = above_m @ misfit_px / weight
+    beside = np.hypot(*(slope_px - group.displacement)) / np.hypot(*group.displacement)
+    clear = np.hypot(*slope_px) > _CLEARLY * rms_px / np.sqrt(weight)
+    return bool(clear and beside < _ABOUT)
 
 
 def _scatter_m(context: PointContext, adjustment: SceneAdjustment) -> float:

@@ -172,6 +172,21 @@ def test_points_that_moved_each_by_itself_are_no_place_of_their_own(seed: int) -
     assert elsewhere_of(context, search) is None
 
 
+@pytest.mark.parametrize("all_move", [True, False])
+def test_two_tall_points_are_believed_where_the_ground_moves_with_its_relief(all_move: bool) -> None:
+    """Two tall points, a low one, and one that moved by itself, of a model that leans otherwise."""
+    place, above_m, ground_m = on_slopes(4, 2.5)
+    tall = np.flatnonzero(above_m > 100.0)
+    above_m[tall] = 16.0, 26.0, 55.0, 74.0
+    off_px = displaced(above_m, np.full(len(place), all_move) | (above_m >= 16.0))
+    off_px[tall[1]] = -9.0, 1.0
+    elsewhere = named(off_px, place, ground_m + above_m)
+    assert (elsewhere is not None) == all_move
+    if elsewhere is not None:
+        assert elsewhere.slope_px is not None
+        np.testing.assert_allclose(elsewhere.slope_px, SLOPE_PX, atol=0.01)
+
+
 def test_lines_that_lie_far_from_the_others_are_found_in_a_wide_window() -> None:
     """A scene of which the last lines lie 40 pixels aside, where a narrow search does not see them."""
     axis = 312.0 + np.linspace(60.0, 340.0, 8)
