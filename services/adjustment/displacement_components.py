@@ -73,6 +73,8 @@ _LENGTHS: dict[Along, tuple[float, ...]] = {
 Along the samples, what is shorter than optics do is a seam between detectors."""
 _COHERENCE = (0.15, 0.4, 2.0)
 """Lengths over which a narrow band keeps its phase, the same."""
+_FEWEST_OF_SWATH = 24
+"""Measures of which a displacement of lines that turn is told: few are explained by whatever turns."""
 _LEAST_SEEN = 0.4
 """Share of its amplitude that chips show of a jitter that can be followed."""
 _FINE = 8
@@ -344,6 +346,8 @@ def _candidates(
     """Components of unit variance that may explain a structure."""
     candidates = []
     for along, families in followed_by.items():
+        if along == "swath" and len(residuals.misfit) < _FEWEST_OF_SWATH:
+            continue
         shown = [one for one in found if one.family in families]
         if min(one.chance for one in shown) <= MAX_CHANCE:
             candidates += _smooth(residuals, along)

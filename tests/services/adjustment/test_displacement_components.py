@@ -178,6 +178,14 @@ def test_what_points_show_along_lines_and_samples_is_followed_with_the_stated_ac
     assert 0.6 < np.mean([one.normalised for one in trials]) < 1.7
 
 
+@pytest.mark.parametrize(("count", "turns"), [(23, 0), (40, 3)])
+def test_few_measures_show_no_lines_that_turn(count: int, turns: int) -> None:
+    """Whatever is wrong with few points, some turn of the lines explains it."""
+    trials = [trial(yaw(12.0, 6_000.0), seed, count=count, wrong=0.0) for seed in (0, 2, 3)]
+    told = [any(part.along == "swath" for part in one.adjustment.components) for one in trials]
+    assert sum(told) == turns
+
+
 @pytest.mark.parametrize("name", list(MOTIONS))
 def test_an_affine_correction_alone_would_be_wrong_and_say_nothing(name: str) -> None:
     """Without the profile the same scenes are off by more than three times what is stated."""
