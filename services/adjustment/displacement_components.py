@@ -206,7 +206,11 @@ def likeliest_components(
     followed_by = _OF_SCANNED if scanned else _OF_ORTHO
     components: list[Component] = []
     told = 0.0
-    affine = found = structures(residuals, _FAMILIES)
+    *along_image, height = structures(residuals, (*_FAMILIES, "height"))
+    affine = found = tuple(along_image)
+    if height.chance < along_image[-1].chance:
+        # Relief that the model sees from another side turns lines, too.
+        followed_by = {along: families for along, families in followed_by.items() if along != "swath"}
     while True:
         clearest = min(found, key=lambda one: one.chance)
         if clearest.chance > MAX_CHANCE or len(components) == _MOST_WITH_SEAMS:

@@ -281,6 +281,26 @@ def test_residuals_that_grow_with_height_are_named_so() -> None:
     assert all(one.chance("height") < MAX_CHANCE for one in trials)
 
 
+def test_relief_that_turns_lines_is_named_and_not_followed() -> None:
+    """Valleys that rise to one side, seen from another side: a turn of the lines explains most of it."""
+    rng = np.random.default_rng(8)
+    for _ in range(4):
+        observations, _ = draw(still, rng, wrong=0.0)
+        place = observations.line_sample
+        along, across = (2.0 * (place - place.min(axis=0)) / np.ptp(place, axis=0) - 1.0).T
+        valleys_m = np.sin(3.0 * along) * (90.0 + 60.0 * across)
+        height_m = valleys_m + rng.normal(0.0, 10.0, len(place))
+        lon_lat_h = observations.lon_lat_h.copy()
+        lon_lat_h[:, 2] = height_m
+        seen = replace(
+            observations, lon_lat_h=lon_lat_h, line_sample=place + np.outer(height_m, [0.06, 0.0])
+        )
+        result = adjust_scene(FlatModel(), SHAPE, seen, AdjustmentOptions())
+        assert all(one.along != "swath" for one in result.components)
+        (height,) = (one for one in result.structures if one.family == "height")
+        assert height.chance < MAX_CHANCE
+
+
 @pytest.mark.long
 def test_heights_with_errors_on_level_ground_are_not_taken_for_another_view() -> None:
     """A point that is too high by its error is displaced by it, in every model."""
