@@ -74,7 +74,7 @@ Along the samples, what is shorter than optics do is a seam between detectors.""
 _COHERENCE = (0.15, 0.4, 2.0)
 """Lengths over which a narrow band keeps its phase, the same."""
 _FEWEST_OF_SWATH = 24
-"""Measures of which a displacement of lines that turn is told: few are explained by whatever turns."""
+"""Fewest measures by which turns of lines are followed: what is wrong with fewer, some turn explains."""
 _LEAST_SEEN = 0.4
 """Share of its amplitude that chips show of a jitter that can be followed."""
 _FINE = 8
@@ -154,7 +154,8 @@ class Component:
             return np.minimum(self.share(first)[:, None], self.share(second)[None, :])
         apart = first[:, None, self.axes] - second[None, :, self.axes]
         smooth = np.exp(-0.5 * (apart**2).sum(axis=2) / self.length_px**2)
-        smooth *= np.outer(self._lever(first), self._lever(second))
+        if self.along == "swath":
+            smooth *= np.outer(self._lever(first), self._lever(second))
         if self.kind == "smooth":
             return np.asarray(smooth)
         return np.asarray(smooth * np.cos(2.0 * np.pi * apart[:, :, 0] / self.at_px))
@@ -206,9 +207,8 @@ def likeliest_components(
     followed_by = _OF_SCANNED if scanned else _OF_ORTHO
     components: list[Component] = []
     told = 0.0
-    *along_image, height = structures(residuals, (*_FAMILIES, "height"))
-    affine = found = tuple(along_image)
-    if height.chance < along_image[-1].chance:
+    affine = found = structures(residuals, _FAMILIES)
+    if scanned and structures(residuals, ("height",))[0].chance < affine[-1].chance:
         # Relief that the model sees from another side turns lines, too.
         followed_by = {along: families for along, families in followed_by.items() if along != "swath"}
     while True:

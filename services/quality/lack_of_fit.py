@@ -56,7 +56,7 @@ scene's."""
 _AMONG, _AS_MANY = 0.15, 0.1
 """Share of the active points between points that agree elsewhere, and number of these over the active
 ones, beyond which the image has two places. A pattern of the ground displaces a few; of those that were
-missed, 24 are searched again."""
+missed, a part is searched again."""
 _CHANCE_OF_SAMPLES = 0.01
 """Of points drawn at random being those of whole samples, at most, to be taken for these."""
 _NODES = 30
