@@ -165,6 +165,32 @@ def test_a_view_without_points_says_where_points_are_and_every_view_has_a_title(
     expect(page).to_have_title("Test block flat · Amers")
 
 
+def test_the_keyboard_keeps_its_place_in_the_list_of_points_when_the_map_moves(visit, secret):
+    """The list is drawn again: the same point has the focus, or the first one when it has left the view."""
+    page = visit("#/points", secret, WIDE)
+    listed = page.get_by_role("list", name="Points in view").get_by_role("link")
+    expect(listed).to_have_count(points_of_the_block)
+    until_drawn(page)
+    focused = listed.nth(points_of_the_block // 2)
+    name = focused.inner_text()
+    focused.focus()
+    turn_the_wheel(page, 200)
+    expect(page.get_by_role("link", name=name, exact=True)).to_be_focused()
+    while name in listed.all_inner_texts():
+        turn_the_wheel(page, -100)
+    expect(listed.first).to_be_focused()
+
+
+def turn_the_wheel(page: Page, down: int) -> None:
+    """Zoom by the wheel of the mouse over the middle of the map, until the points in view are listed again."""
+    page.locator(".list a").evaluate_all("links => links.forEach((link) => (link.className = 'before'))")
+    box = page.locator("#map").bounding_box()
+    assert box
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.wheel(0, down)
+    expect(page.locator(".list a.before")).to_have_count(0)
+
+
 def test_a_withdrawal_asks_first_and_the_keyboard_can_refuse_it(visit, administrator):
     page = visit("#/block/1", administrator, WIDE)
     state = page.locator(".badge")

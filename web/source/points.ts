@@ -41,7 +41,7 @@ export const showPoints: ShowView = async ({ panel, atlas, signal }) => {
       if (!stays()) return;
       const total = page.numberMatched;
       count.textContent = total > page.features.length ? `${plural(total, "point")}, the first ${page.features.length}:` : plural(total, "point");
-      list.replaceChildren(...page.features.map(row));
+      replaceRows(list, page.features.map(row));
       nothing.hidden = total > 0;
     } catch (error) {
       if (stays()) count.replaceChildren(problem(error));
@@ -94,6 +94,15 @@ async function show(chips: HTMLElement, id: string, view: PointViewProperties, n
   } catch (error) {
     if (!signal.aborted) image.replaceWith(problem(error));
   }
+}
+
+/** Replace the rows of a list; the link that has the focus keeps it, or the first has it where that one is gone. */
+function replaceRows(list: HTMLElement, rows: HTMLElement[]): void {
+  const focused = list.contains(document.activeElement) && document.activeElement?.getAttribute("href");
+  list.replaceChildren(...rows);
+  if (!focused) return;
+  const links = [...list.querySelectorAll("a")];
+  (links.find((link) => link.getAttribute("href") === focused) ?? links[0])?.focus({ preventScroll: true });
 }
 
 function row(point: PointOfPage): HTMLElement {
