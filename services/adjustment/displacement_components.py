@@ -17,6 +17,7 @@ from typing import Literal
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpstrf
+from scipy.spatial.distance import cdist
 from scipy.special import eval_legendre
 
 from services.adjustment.structure import ALONG_AXES, Family, Residuals, Structure, structures
@@ -152,13 +153,15 @@ class Component:
             return np.outer(self.polynomial(first), self.polynomial(second))
         if self.is_step:
             return np.minimum(self.share(first)[:, None], self.share(second)[None, :])
-        apart = first[:, None, self.axes] - second[None, :, self.axes]
-        smooth = np.exp(-0.5 * (apart**2).sum(axis=2) / self.length_px**2)
+        apart2 = cdist(first[:, self.axes], second[:, self.axes], "sqeuclidean")
+        smooth = np.exp(apart2 * (-0.5 / self.length_px**2))
         if self.along == "swath":
             smooth *= np.outer(self._lever(first), self._lever(second))
         if self.kind == "smooth":
             return np.asarray(smooth)
-        return np.asarray(smooth * np.cos(2.0 * np.pi * apart[:, :, 0] / self.at_px))
+        first_px, second_px = (places[:, self.axes.start] for places in (first, second))
+        turns = (first_px[:, None] - second_px[None, :]) / self.at_px
+        return np.asarray(smooth * np.cos(2.0 * np.pi * turns))
 
     def covariance(self, first: Array, second: Array) -> Array:
         """Covariance (2, m, n) of what chips show at positions (m, 2) and (n, 2), of line and sample."""

@@ -126,6 +126,9 @@ def solve_displacement(
     evenly = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     t_evenly = by_affine(evenly, frame)
     fitted = np.linalg.pinv(t_evenly)
+    seen_of_parts = [_seen(places, some, residuals.line_sample) for places, some in parts]
+    seen_everywhere = _seen(evenly[None], components, residuals.line_sample)
+    among_evenly = [one.correlation(evenly, evenly) / one.seen**2 for one in components]
     parameters, covariance, displacement, variance = [], [], [], []
     for k in range(2):
         inverse = np.linalg.inv(full.covariance[k])
@@ -134,7 +137,7 @@ def solve_displacement(
         own = np.asarray(np.linalg.pinv(normal, hermitian=True), np.float64)
         value = own @ (weighted.T @ full.misfit[:, k])
         rest = full.misfit[:, k] - full.design @ value
-        seen = [_seen(places, some, k, residuals.line_sample) for places, some in parts]
+        seen = [both[k] for both in seen_of_parts]
         gain = [one @ inverse for one in seen]
         moved = sum(one @ full.design for one in gain)
         explained = sum(np.einsum("kmn,kmn->km", first, second) for first in gain for second in seen)
@@ -143,12 +146,12 @@ def solve_displacement(
         total = unseen - explained + (left @ own * left).sum(axis=-1)
         mean = np.broadcast_to(sum(one @ rest for one in gain), t.shape[:2])
         # Its affine part belongs to the parameters: both are uncertain by much more than their sum.
-        seen_evenly = _seen(evenly[None], components, k, full.line_sample)[0]
+        seen_evenly = seen_everywhere[k, 0]
         gain_evenly = seen_evenly @ inverse
         affine = fitted @ gain_evenly @ rest
         left = padded(t_evenly, len(own)) - gain_evenly @ full.design
         among = sum(
-            one.variance_px2[k] / one.seen**2 * one.correlation(evenly, evenly) for one in components
+            one.variance_px2[k] * shared for one, shared in zip(components, among_evenly, strict=True)
         )
         errors = among - gain_evenly @ seen_evenly.T + left @ own @ left.T
         uncertain = fitted @ errors @ fitted.T
@@ -175,13 +178,11 @@ def padded(t: Array, count: int) -> Array:
     return np.concatenate([t, np.zeros((*t.shape[:-1], count - 3))], axis=-1)
 
 
-def _seen(places: Array, components: Sequence[Component], k: int, line_sample: Array) -> Array:
-    """Covariance (k, m, n) of a coordinate at places (k, m, 2) with what chips show at points (n, 2)."""
+def _seen(places: Array, components: Sequence[Component], line_sample: Array) -> Array:
+    """Covariance (2, k, m, n), by coordinate, of places (k, m, 2) and what chips show at points."""
     flat = places.reshape(-1, 2)
-    total = sum(
-        one.variance_px2[k] / one.seen * one.correlation(flat, line_sample) for one in components
-    )
-    return np.asarray(total).reshape(*places.shape[:2], -1)
+    total = sum(one.covariance(flat, line_sample) / one.seen for one in components)
+    return np.asarray(total).reshape(2, *places.shape[:2], -1)
 
 
 def joined(covariance: Array) -> Array:
