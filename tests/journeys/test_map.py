@@ -166,7 +166,7 @@ def test_a_view_without_points_says_where_points_are_and_every_view_has_a_title(
 
 
 def test_the_keyboard_keeps_its_place_in_the_list_of_points_when_the_map_moves(visit, secret):
-    """The list is drawn again: the same point has the focus, or the first one when it has left the view."""
+    """The list is drawn again: the same point has the focus, or the first when it has left the view."""
     page = visit("#/points", secret, WIDE)
     listed = page.get_by_role("list", name="Points in view").get_by_role("link")
     expect(listed).to_have_count(points_of_the_block)
@@ -182,7 +182,7 @@ def test_the_keyboard_keeps_its_place_in_the_list_of_points_when_the_map_moves(v
 
 
 def turn_the_wheel(page: Page, down: int) -> None:
-    """Zoom by the wheel of the mouse over the middle of the map, until the points in view are listed again."""
+    """Zoom by the wheel over the middle of the map, until the points in view are listed again."""
     page.locator(".list a").evaluate_all("links => links.forEach((link) => (link.className = 'before'))")
     box = page.locator("#map").bounding_box()
     assert box
