@@ -9,7 +9,8 @@ AmersError
 └── ComputationError        the input is valid, but gives no trustworthy result
     ├── NotEnoughPoints
     ├── NoConsensus
-    │   └── TurnedImage     they agree on an image whose axes are others than those of its model
+    │   ├── TurnedImage     they agree on an image whose axes are others than those of its model
+    │   └── BrokenImage     lines of the image were lost or repeated
     ├── UndeterminedCorrection
     ├── DisconnectedBlock
     ├── DoesNotFit
@@ -68,6 +69,10 @@ class NoConsensus(ComputationError):
 
 class TurnedImage(NoConsensus):
     """The measures agree on an image that is mirrored, upside down or whose axes are swapped."""
+
+
+class BrokenImage(NoConsensus):
+    """The image has parts that lie apart: between them, lines were lost or repeated."""
 
 
 class UndeterminedCorrection(ComputationError):

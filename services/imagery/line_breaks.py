@@ -52,6 +52,11 @@ def scene_breaks(scene: Scene) -> IntArray:
     return line_breaks(scene.image)
 
 
+def format_breaks(breaks: IntArray) -> str:
+    """What breaks (k,) are and where they lie, in words."""
+    return f"the pixels show lost or repeated lines at line {', '.join(map(str, breaks.tolist()))}"
+
+
 def line_breaks(image: ImageSource) -> IntArray:
     """First lines (k,) behind breaks, ascending; none where there are more than eight.
 

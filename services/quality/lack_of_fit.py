@@ -11,6 +11,7 @@ from scipy.special import comb
 
 from services.adjustment.broken_image import FEWEST_IN_PART, held_parts, part_of_line
 from services.adjustment.structure import Family, Structure
+from services.imagery.line_breaks import format_breaks
 from services.quality.criteria import Criterion, Grade, at_most
 from services.quality.missed_along import UNFOUND, missed_along, missed_at_borders
 from services.types import Array, BoolArray, IntArray
@@ -151,13 +152,12 @@ def breaks_criterion(breaks: IntArray, line: Array, followed: bool, lines: int) 
     criterion = at_most("lines_behind_breaks", percent, 0.0, "usable")
     if criterion.met:
         return criterion
-    where = ", ".join(str(one) for one in breaks.tolist())
     why = (
         f"fewer than {FEWEST_IN_PART} points agree in {int((~held).sum())} of the {len(held)} parts"
         if followed
         else "this correction does not follow that"
     )
-    shown = f"the pixels show lost or repeated lines at line {where}; {why}"
+    shown = f"{format_breaks(breaks)}; {why}"
     return replace(criterion, note=f"{shown}: cut the image there, and register its parts")
 
 

@@ -17,6 +17,7 @@ from services.quality.lack_of_fit import Elsewhere
 from services.quality.qualification import Qualification, qualify
 from services.quality.stability import AdjustedScene
 from services.registration.another_view import another_view
+from services.registration.broken import naming_breaks
 from services.registration.chip_selection import fine_gsd_m
 from services.registration.coarse import needs_coarse_search, search_coarsely
 from services.registration.context import PointContext, Prediction, RegistrationContext, SearchStage
@@ -108,11 +109,13 @@ def register_scene(
         NotEnoughPoints: too few points were found.
         NoConsensus: the points found do not agree on one correction.
         TurnedImage: they agree on an image that is turned.
+        BrokenImage: one of the two before, and lines of the image were lost or repeated.
     """
     try:
-        context, search, adjustment = search_scene(
-            scene, points, chips, options, progress=progress, stages=stages
-        )
+        with naming_breaks(scene):
+            context, search, adjustment = search_scene(
+                scene, points, chips, options, progress=progress, stages=stages
+            )
     except (NoConsensus, NotEnoughPoints) as error:
         turned = _how_it_is_turned(scene, points, chips, options)
         if not turned:

@@ -26,6 +26,7 @@ from services.matching.reference_image import (
     visible_places,
 )
 from services.quality.stability import image_places
+from services.registration.broken import naming_breaks
 from services.registration.context import PointContext, Prediction, RegistrationContext, SearchStage
 from services.registration.elsewhere import adjust_with_places
 from services.registration.far import search_far
@@ -116,6 +117,7 @@ def register_on_reference(
         CoverageError: the reference or its terrain does not show what the scene shows.
         NotEnoughPoints: too few places were found.
         NoConsensus: the places found do not agree on one correction.
+        BrokenImage: one of the two before, and lines of the image were lost or repeated.
         InputError: heights move what the scene shows, and there is no terrain.
     """
     context = _ReferenceContext(
@@ -127,6 +129,18 @@ def register_on_reference(
         reference=reference,
         finest_factor=_finest_factor(scene, reference),
     )
+    with naming_breaks(scene):
+        search, adjustment = _search_levels(context, earlier_places)
+    of_places = _with_chips(context, search)
+    search, adjustment, elsewhere = adjust_with_places(of_places, search, adjustment)
+    return build_registration(context, search.points, search, adjustment, elsewhere)
+
+
+def _search_levels(
+    context: _ReferenceContext, earlier_places: Array | None
+) -> tuple[Search, SceneAdjustment]:
+    """The last search, after those of coarser levels from the one that the error of the model needs."""
+    options = context.options
     level = _first_level(context)
     while level.is_first or level.factor > context.finest_factor:
         part = context.part(min(0.1 * len(context.stages), 0.4), 0.1)
@@ -136,14 +150,13 @@ def register_on_reference(
         before = level.model.correction
         search, adjustment = _search(part, level, options.reference.places, earlier_places)
         level = _next_level(context, level, search, adjustment)
-        displacement_px = _largest_displacement_px(before, level.model.correction, scene.image.shape)
+        shape = context.scene.image.shape
+        displacement_px = _largest_displacement_px(before, level.model.correction, shape)
         if displacement_px <= options.reference.settled_px * context.finest_factor:
             break
     if options.adjustment.bends:
-        adjustment = adjust_search(scene, search, options.adjustment)
-    of_places = _with_chips(context, search)
-    search, adjustment, elsewhere = adjust_with_places(of_places, search, adjustment)
-    return build_registration(context, search.points, search, adjustment, elsewhere)
+        adjustment = adjust_search(context.scene, search, options.adjustment)
+    return search, adjustment
 
 
 def _with_chips(context: _ReferenceContext, search: Search) -> PointContext:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from services.conventions import MAX_ERROR_SIGMAS
-from services.errors import CoverageError, NoConsensus, NotEnoughPoints, TurnedImage
+from services.errors import BrokenImage, CoverageError, NoConsensus, NotEnoughPoints, TurnedImage
 from services.quality.accuracy_statement import AccuracyStatement, StatedAccuracy, no_accuracy
 from services.registration.context import SearchStage
 from services.registration.search import larger_sigma_m
@@ -103,6 +103,12 @@ def next_steps(
     if isinstance(error, TurnedImage):
         text = "Turn the image or its model as the reason says, and run the registration again."
         return (NextStep(text, command),)
+    if isinstance(error, BrokenImage):
+        text = (
+            "Have the image delivered without lost or repeated lines, or cut it at the lines that the "
+            "reason names and register the parts that show enough points."
+        )
+        return (NextStep(text, ""),)
     if not stages:
         return (*_find_control(scene, command), _state_larger(scene, command))
     last = stages[-1]

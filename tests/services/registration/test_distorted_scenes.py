@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.errors import TurnedImage
+from services.errors import BrokenImage, NotEnoughPoints, TurnedImage
 from services.quality.normal_law import normal_ce90
 from services.registration.on_points import Registration, register_scene
 from services.simulation.distortion import (
@@ -124,6 +124,19 @@ def test_lines_that_are_repeated_beyond_all_points_are_named() -> None:
     lines, samples = shape()
     behind = np.array([[0.97 * lines, 0.2 * samples], [0.99 * lines, 0.8 * samples]])
     assert normal_ce90(result.adjustment.covariance_at(behind)).min() > 50.0
+
+
+def test_a_refusal_says_at_which_lines_the_pixels_show_that_some_were_lost() -> None:
+    """Five points are too few for any scene; of one whose lines are whole nothing more is said."""
+    view, how = view_of(FIRST), distortion("lost lines")
+    points, chips = block()
+    few = points.take(np.arange(5))
+    line = how.steps[0].line
+    broken = replace(view.as_scene(SIGMA_M), image=DistortedImage(view.image, how))
+    with pytest.raises(BrokenImage, match=rf"lost or repeated lines at line {line}: .* \(.*needed"):
+        register_scene(broken, few, chips)
+    with pytest.raises(NotEnoughPoints):
+        register_scene(view.as_scene(SIGMA_M), few, chips)
 
 
 @pytest.mark.parametrize("name", ["swapped", "mirrored", "upside down"])

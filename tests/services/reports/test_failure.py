@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 
-from services.errors import CoverageError, FormatError, NoConsensus, NotEnoughPoints, TurnedImage
+from services.errors import (
+    BrokenImage,
+    CoverageError,
+    FormatError,
+    NoConsensus,
+    NotEnoughPoints,
+    TurnedImage,
+)
 from services.registration.context import Candidate, NotFound, SearchStage
 from services.registration.options import RegistrationOptions
 from services.reports.document import failure_schema, report_document
@@ -130,6 +137,12 @@ def test_a_turned_image_is_to_be_turned_and_not_searched_farther(report):
     (step,) = next_steps(TurnedImage("upside down"), report.scene, (STAGE,), COMMAND)
     assert step.text.startswith("Turn the image or its model")
     assert step.command == COMMAND
+
+
+def test_an_image_with_lost_lines_is_to_be_cut_and_not_searched_farther(report):
+    (step,) = next_steps(BrokenImage("at line 356"), report.scene, (STAGE,), COMMAND)
+    assert "cut it at the lines" in step.text
+    assert step.command == ""
 
 
 def test_without_a_visible_point_the_ground_is_looked_up(report):
