@@ -211,7 +211,7 @@ def likeliest_components(
     components: list[Component] = []
     told = 0.0
     affine = found = structures(residuals, _FAMILIES)
-    if scanned and structures(residuals, ("height",))[0].chance < affine[-1].chance:
+    if scanned and structures(residuals, ("height",))[0].chance < min(one.chance for one in affine):
         # Relief that the model sees from another side turns lines, too.
         followed_by = {along: families for along, families in followed_by.items() if along != "swath"}
     while True:
