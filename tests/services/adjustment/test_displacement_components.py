@@ -301,6 +301,24 @@ def test_relief_that_turns_lines_is_named_and_not_followed() -> None:
         assert height.chance < MAX_CHANCE
 
 
+def test_lines_that_swing_above_hills_still_turn() -> None:
+    """Residuals that follow hills by chance, but lines far more clearly, are of no other view."""
+    motion = both(jitter(2600.0, (2.0, 4.0)), yaw(3.0, 6_000.0, 3.0))
+    for seed in range(3):
+        observations, truth = draw(motion, np.random.default_rng(seed), wrong=0.0)
+        lon_lat_h = observations.lon_lat_h.copy()
+        swings = motion(observations.line_sample)[:, 1]
+        lon_lat_h[:, 2] = 40.0 * swings + np.random.default_rng(seed).normal(0.0, 60.0, len(swings))
+        above_hills = replace(observations, lon_lat_h=lon_lat_h)
+        result = adjust_scene(FlatModel(), SHAPE, above_hills, AdjustmentOptions())
+        assert "swath" in {one.along for one in result.components}
+        places = np.random.default_rng(0).random((300, 2)) * (np.array(SHAPE) - 1.0)
+        error = result.correction.apply(places) - truth.apply(places) - motion(places)
+        assert np.quantile(np.hypot(*error.T), 0.9) < WRONG * np.median(
+            normal_ce90(result.covariance_at(result.correction.apply(places)))
+        )
+
+
 @pytest.mark.long
 def test_heights_with_errors_on_level_ground_are_not_taken_for_another_view() -> None:
     """A point that is too high by its error is displaced by it, in every model."""
