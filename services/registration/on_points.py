@@ -109,7 +109,7 @@ def register_scene(
         NotEnoughPoints: too few points were found.
         NoConsensus: the points found do not agree on one correction.
         TurnedImage: they agree on an image that is turned.
-        BrokenImage: one of the two before, and lines of the image were lost or repeated.
+        BrokenImage: too few points were found, or agree, and lines of the image were lost or repeated.
     """
     try:
         with naming_breaks(scene):

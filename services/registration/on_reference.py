@@ -117,7 +117,7 @@ def register_on_reference(
         CoverageError: the reference or its terrain does not show what the scene shows.
         NotEnoughPoints: too few places were found.
         NoConsensus: the places found do not agree on one correction.
-        BrokenImage: one of the two before, and lines of the image were lost or repeated.
+        BrokenImage: too few places were found, or agree, and lines of the image were lost or repeated.
         InputError: heights move what the scene shows, and there is no terrain.
     """
     context = _ReferenceContext(

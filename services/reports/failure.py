@@ -108,7 +108,14 @@ def next_steps(
             "Have the image delivered without lost or repeated lines, or cut it at the lines that the "
             "reason names and register the parts that show enough points."
         )
-        return (NextStep(text, ""),)
+        return NextStep(text, ""), *_search_otherwise(scene, stages, command)
+    return _search_otherwise(scene, stages, command)
+
+
+def _search_otherwise(
+    scene: SceneRecord, stages: tuple[SearchStage, ...], command: str
+) -> tuple[NextStep, ...]:
+    """What to try where the searches of a scene, if any was made, did not find enough points."""
     if not stages:
         return (*_find_control(scene, command), _state_larger(scene, command))
     last = stages[-1]
