@@ -21,5 +21,5 @@ def naming_breaks(scene: Scene) -> Iterator[None]:
         breaks = scene_breaks(scene)
         if not len(breaks):
             raise
-        parts = f"it has {len(breaks) + 1} parts that lie apart"
+        parts = f"the image has {len(breaks) + 1} parts that lie apart"
         raise BrokenImage(f"{format_breaks(breaks)}: {parts} ({error})") from error
