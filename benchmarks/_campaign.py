@@ -33,8 +33,8 @@ class Outcome:
         reason: the unmet criteria, or why there is no result.
         visible, matched, active: numbers of points.
         order: of the correction.
-        ce90_before_m, ce90_m: against the truth in the frame of the block, over the whole image.
-        ground_ce90_m: against the truth on the Earth.
+        ce90_before_m: of the delivered model, against the truth on the Earth, over the whole image.
+        ce90_m, ground_ce90_m: against the truth in the frame of the active points, and on the Earth.
         predicted_m, predicted_worst_m: CE90 as stated, over the image and at its worst place.
         normalised: mean square of true errors over stated deviations, over the image.
         displacement_m: stability test, largest of the medians of the corners and the centre.
@@ -124,7 +124,10 @@ def outcome_of(
         cpu_s = time.process_time() - start_s
         refused = Outcome("refused", str(error), 0, 0, 0, "", *[float("nan")] * 7, cpu_s)
         return _with_spacing(refused, truth, scene, options), None
-    outcome = _judged(scene, registration, truth, time.process_time() - start_s)
+    cpu_s = time.process_time() - start_s
+    measures = registration.measures
+    used = points.block[np.isin(points.id, measures.point_id[measures.active])]
+    outcome = _judged(scene, registration, truth, truth.in_frame(used), cpu_s)
     return _with_spacing(outcome, truth, scene, options), registration
 
 
@@ -135,9 +138,11 @@ def _with_spacing(outcome: Outcome, truth: Truth, scene: Scene, options: Registr
     return replace(outcome, spacing_px=spacing_px, followable=truth.shortest_px >= 2.0 * spacing_px)
 
 
-def _judged(scene: Scene, registration: Registration, truth: Truth, cpu_s: float) -> Outcome:
-    """The errors of a registration against the truth."""
-    line_sample, shown, in_frame = truth.line_sample, truth.on_earth, truth.in_frame
+def _judged(
+    scene: Scene, registration: Registration, truth: Truth, in_frame: Array, cpu_s: float
+) -> Outcome:
+    """The errors of a registration against the truth; the ground (n, 3) also as its points say."""
+    line_sample, shown = truth.line_sample, truth.on_earth
 
     def error_px(ground: Array) -> Array:
         return np.asarray(registration.model.project(ground) - line_sample)

@@ -46,16 +46,18 @@ class BlockErrors:
         t = np.clip(self.along(lon_lat_h), -1.5, 1.5)
         return np.asarray(np.column_stack([t, 1.5 * t**2 - 0.5]) @ self.warp_m)
 
-    def in_frame(self, lon_lat_h: Array) -> Array:
-        """True ground (n, 3) where the points say that it is: distorted, and moved by their frame.
+    def in_frame(self, lon_lat_h: Array, used: IntArray) -> Array:
+        """True ground (n, 3) where the points used say that it is: distorted, and moved by their frame.
 
-        The frame of a single block is its offset. Several blocks scatter about the Earth: what they
+        The frame of points of one block is its offset. Several blocks scatter about the Earth: what they
         disagree by is an error relative to the points.
 
         Args:
             lon_lat_h: (n, 3) on the Earth.
+            used: (k,) blocks of the points that are used.
         """
-        frame_m = self.offset_m[0] if len(self.offset_m) == 1 else np.zeros(3)
+        blocks = np.unique(used)
+        frame_m = self.offset_m[blocks[0]] if len(blocks) == 1 else np.zeros(3)
         return move_metres(lon_lat_h, frame_m + self.warp_at(lon_lat_h))
 
 

@@ -194,8 +194,8 @@ def _truth(plan: RealScene, view: RealView, distortion: Distortion) -> Truth:
     ground = view.ground[shown]
     return Truth(
         line_sample=line_sample[shown],
-        in_frame=ground,
         on_earth=ground,
+        in_frame=lambda used: ground,
         judged_share=float(distortion.is_unique(_grid(shape)).mean()),
         shown_points=int(in_image(view.placed - corner, shape, 0.0).sum()),
         shortest_px=plan.drawn.shortest_px,

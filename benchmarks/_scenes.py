@@ -1,7 +1,9 @@
 """The scene of a trial: what a registration gets, and the truth about it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
+from functools import partial
 
 import numpy as np
 
@@ -22,7 +24,7 @@ from services.simulation.render import surface_seen
 from services.simulation.tiles import TiledView, Tiles
 from services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
 from services.simulation.world import World, with_smoother_terrain
-from services.types import Array, ControlPoints
+from services.types import Array, ControlPoints, IntArray
 
 
 @dataclass(frozen=True)
@@ -31,15 +33,16 @@ class Truth:
 
     Attributes:
         line_sample: (n, 2) pixels all over the image that show what belongs there.
-        in_frame, on_earth: (n, 3) their ground, as the points say and as it is.
+        on_earth: (n, 3) their ground.
+        in_frame: the same (n, 3), as points say that are used, by their blocks (k,).
         judged_share: of the image that such pixels stand for.
         shown_points: number of points that the image shows.
         shortest_px: period that points must resolve to follow the distortion, see `Drawn`.
     """
 
     line_sample: Array
-    in_frame: Array
     on_earth: Array
+    in_frame: Callable[[IntArray], Array]
     judged_share: float
     shown_points: int
     shortest_px: float = 0.0
@@ -82,8 +85,8 @@ class Prepared:
         place = self.geometry.true_model.project(self.points.lon_lat_h)
         return Truth(
             line_sample=pixels,
-            in_frame=self.errors.in_frame(on_earth),
             on_earth=on_earth,
+            in_frame=partial(self.errors.in_frame, on_earth),
             judged_share=float(unique.mean()),
             shown_points=int(in_image(place, shape, 0.0).sum()),
             shortest_px=self.shortest_px,

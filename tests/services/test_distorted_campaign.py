@@ -1,4 +1,4 @@
-"""Distorted scenes of the campaign: drawn as stated, rendered as drawn, judged by their own truth."""
+"""Scenes of the campaign: drawn as stated, rendered as drawn, judged by their own truth."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks._campaign import Outcome, attempt
+from benchmarks._campaign import Outcome, attempt, outcome_of
 from benchmarks._distorted_tables import accused, by_kind, distorted_acceptance, figures_of
 from benchmarks._distorted_trials import DISTORTED, distorted_trial
 from benchmarks._distortions import (
@@ -24,6 +24,7 @@ from benchmarks._families import outcome_line, read_outcomes
 from benchmarks._scenes import Prepared, prepare
 from benchmarks._trials import draw_trial
 from benchmarks._worlds import Block, Place, block_of
+from services.geodesy import move_metres
 from services.registration.options import RegistrationOptions
 
 pytestmark = pytest.mark.long
@@ -160,6 +161,39 @@ def test_a_scene_without_distortion_is_right_and_a_mirrored_one_refused(block: B
     mirrored = attempt(SMALL, replace(trial, distortion=Drawn("mirrored")), block, SEED, OPTIONS)
     assert not mirrored.delivered
     assert mirrored.spacing_px == clean.spacing_px
+
+
+@pytest.mark.thorough
+def test_points_of_one_block_of_several_are_judged_in_its_frame(block: Block) -> None:
+    """Points of a block 20 m off give a model 20 m off the Earth, but not off these points."""
+    trial = distorted_trial("jitter", SEED, 1, (SMALL,))
+    trial = replace(trial, distortion=Drawn(), blocks=2, frame_sigma_m=1.0, point_ce90_m=1.0)
+    prepared = prepare(SMALL, trial, block, SEED)
+    first = np.flatnonzero(prepared.points.block == 0)
+    assert 0 < len(first) < len(prepared.points)
+    away_m = np.array([20.0, 0.0, 0.0])
+    offset_m = np.array([away_m, -away_m])
+    errors = replace(prepared.errors, offset_m=offset_m)
+    moved_m = (offset_m - prepared.errors.offset_m)[prepared.points.block]
+    points = replace(prepared.points, lon_lat_h=move_metres(prepared.points.lon_lat_h, moved_m))
+    truth = replace(prepared, points=points, errors=errors).truth()
+    chips = replace(block, points=points)
+    scene = replace(prepared.scene, sigma_m=30.0)
+    outcome, _ = outcome_of(scene, points.take(first), chips, OPTIONS, truth)
+    assert outcome.delivered
+    assert not outcome.wrong
+    assert outcome.normalised < 4.0
+    assert outcome.ground_ce90_m == pytest.approx(20.0, abs=3.0)
+
+
+def test_the_frame_of_points_of_several_blocks_is_the_earth(block: Block) -> None:
+    trial = replace(distorted_trial("jitter", SEED, 1, (SMALL,)), blocks=3, frame_sigma_m=3.0)
+    errors = prepare(SMALL, trial, block, SEED).errors
+    ground = np.array([[*errors.centre_lon_lat, 100.0]])
+    of_one = [errors.in_frame(ground, np.full(4, k)) for k in range(3)]
+    for k in range(3):
+        np.testing.assert_array_equal(of_one[k], move_metres(ground, errors.offset_m[[k]]))
+    np.testing.assert_array_equal(errors.in_frame(ground, np.array([2, 0, 2])), ground)
 
 
 def test_outcomes_of_distorted_scenes_are_read_back(tmp_path: Path) -> None:
