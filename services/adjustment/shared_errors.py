@@ -89,9 +89,12 @@ def overlap_correlation(position_px: Array, side_px: float, own_share: Array) ->
     """
     if side_px <= 0.0:
         return np.eye(len(position_px))
-    apart = np.minimum(_distance(position_px) / (side_px * 2.0 / np.sqrt(np.pi)), 1.0)
+    apart = _distance(position_px) / (side_px * 2.0 / np.sqrt(np.pi))
+    first, second = np.nonzero(apart < 1.0)
+    apart = apart[first, second]
     overlap = (np.arccos(apart) - apart * np.sqrt(1.0 - apart**2)) * 2.0 / np.pi
-    correlation = overlap * np.sqrt(np.outer(own_share, own_share))
+    correlation = np.zeros((len(position_px), len(position_px)))
+    correlation[first, second] = overlap * np.sqrt(own_share[first] * own_share[second])
     np.fill_diagonal(correlation, 1.0)
     return np.asarray(correlation)
 
