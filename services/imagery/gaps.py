@@ -68,27 +68,45 @@ def _blurred(where: BoolArray, sigma_px: float) -> FloatImage:
 def _filled(pixels: FloatImage, weights: Array) -> FloatImage:
     lines, samples = pixels.shape
     total, count = 0.0, 0
+    has_valid = np.zeros(pixels.shape, dtype=np.bool_)
     for i in range(lines):
-        for j in range(samples):
-            if np.isfinite(pixels[i, j]):
-                total += pixels[i, j]
+        within = 0
+        for j in range(-len(weights) + 1, samples):
+            ahead = j + len(weights) - 1
+            if ahead < samples and np.isfinite(pixels[i, ahead]):
+                total += pixels[i, ahead]
                 count += 1
+                within += 1
+            behind = j - len(weights)
+            if behind >= 0 and np.isfinite(pixels[i, behind]):
+                within -= 1
+            if j >= 0:
+                has_valid[i, j] = within > 0
     out = pixels.copy()
     for i in range(lines):
         for j in range(samples):
             if not np.isfinite(pixels[i, j]):
-                value = _mean_around(pixels, i, j, weights) if count else 0.0
+                value = _mean_around(pixels, i, j, weights, has_valid) if count else 0.0
                 out[i, j] = value if value == value else total / count
     return out
 
 
 @njit(cache=True, error_model="numpy")
-def _mean_around(pixels: FloatImage, i: int, j: int, weights: Array) -> float:
-    """Weighted mean of the valid pixels around one; NaN without any."""
+def _mean_around(pixels: FloatImage, i: int, j: int, weights: Array, has_valid: BoolArray) -> float:
+    """Weighted mean of the valid pixels around one; NaN without any.
+
+    Args:
+        pixels: with gaps.
+        i, j: line and sample of the one.
+        weights: along each axis, by the distance.
+        has_valid: whether pixels of the same line have valid ones around them.
+    """
     lines, samples = pixels.shape
     reach = len(weights) - 1
     value, weight = 0.0, 0.0
     for k in range(max(i - reach, 0), min(i + reach + 1, lines)):
+        if not has_valid[k, j]:
+            continue
         for m in range(max(j - reach, 0), min(j + reach + 1, samples)):
             if np.isfinite(pixels[k, m]):
                 w = weights[abs(k - i)] * weights[abs(m - j)]

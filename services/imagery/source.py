@@ -188,10 +188,13 @@ def block_means(pixels: FloatImage, factor: int) -> FloatImage:
     if np.isfinite(means).all():
         return means
     share = means_of((~np.isfinite(whole)).astype(np.float32))
-    saturated = means_of(np.isposinf(whole).astype(np.float32))
-    means = means_of(filled(whole))
-    means[share > LOST_SHARE] = np.nan
-    means[(share > LOST_SHARE) & (saturated > share / 2.0)] = np.inf
+    lost = share > LOST_SHARE
+    if not (lost | (share == 0.0)).all():
+        means = means_of(filled(whole))
+    means[lost] = np.nan
+    saturated = np.isposinf(whole)
+    if saturated.any():
+        means[lost & (means_of(saturated.astype(np.float32)) > share / 2.0)] = np.inf
     return means
 
 
