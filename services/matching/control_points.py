@@ -122,6 +122,7 @@ class ChipSearch:
         radius_px: search radius, pixels of the chips.
         thresholds: of the correlation of grey values; None takes those of the options.
         half_side: of the part of each chip, around its point, that is searched, pixels of the chips.
+        strips: whether strips of the chips are compared, too, which show motion within the chips.
     """
 
     image: ImageSource | ReducedImage
@@ -131,6 +132,7 @@ class ChipSearch:
     radius_px: int
     thresholds: PeakThresholds | None = None
     half_side: int = CHIP_CENTRE
+    strips: bool = True
 
 
 @dataclass(frozen=True)
@@ -315,7 +317,7 @@ def _assembled(
         by_gradient=np.array([match.by_gradient for match in matches], dtype=bool),
         common_covariance_m2=_common_covariance_px2(search, points, matches, order) * search.gsd_m**2,
         view_measures=_view_measures(matches),
-        strips=_strips(search, points, matches),
+        strips=_strips(search, points, matches) if search.strips else None,
     )
 
 

@@ -170,16 +170,16 @@ def search_scene(
     context = replace(context, breaks=scene_breaks(scene))
     for stage, part in enumerate(context.parts(0.3, 0.6, options.fine_stages), start=1):
         rows = points_to_try(scene, points, prediction, options.max_points)
-        search = _match(part, prediction, rows)
         last = stage == options.fine_stages
+        search = _match(part, prediction, rows, strips=last)
         adjustment = adjust_search(scene, search, options.adjustment, ground_may_move=last)
         prediction = predict(scene, points, adjustment)
     return context, *search_missed_points(context, prediction, search, adjustment)
 
 
-def _match(context: PointContext, prediction: Prediction, rows: IntArray) -> Search:
+def _match(context: PointContext, prediction: Prediction, rows: IntArray, *, strips: bool) -> Search:
     """A search of some of the points with the fine chips, of which enough have to agree."""
-    search, tolerance_px = search_near(context, prediction, rows)
+    search, tolerance_px = search_near(context, prediction, rows, strips=strips)
     scene, stage = context.scene, context.stages[-1]
     lon_lat_h, measured = search.points.lon_lat_h, search.matches.line_sample
     predicted = prediction.model.project(lon_lat_h)
@@ -194,13 +194,16 @@ def _match(context: PointContext, prediction: Prediction, rows: IntArray) -> Sea
     return search
 
 
-def search_near(context: PointContext, prediction: Prediction, rows: IntArray) -> tuple[Search, float]:
+def search_near(
+    context: PointContext, prediction: Prediction, rows: IntArray, *, strips: bool = True
+) -> tuple[Search, float]:
     """A search of some of the points with the fine chips, within the error of their prediction.
 
     Args:
         context: of the registration; the summary of the search is added to it.
         prediction: of all its points.
         rows: of the points to search.
+        strips: whether motion within the chips is looked for, which only the last search tells.
 
     Returns:
         The search, and the tolerance within which its inliers agree, pixels.
@@ -210,7 +213,7 @@ def search_near(context: PointContext, prediction: Prediction, rows: IntArray) -
     error_m = largest_error_m(prediction.uncertainty_m[rows])
     radius_px = min(search_radius_px(error_m, gsd_m), options.coarse.max_search_px)
     chip_search = ChipSearch(
-        context.image, prediction.model, context.scene.acquisition, gsd_m, radius_px
+        context.image, prediction.model, context.scene.acquisition, gsd_m, radius_px, strips=strips
     )
     matches = match_points(chip_search, points, context.chips, options.matching, context.progress)
     inliers, tolerance_px = select_inliers(prediction.model, points, matches)
