@@ -16,7 +16,13 @@ from services.matching.consensus import (
     a_contrario_consensus,
     consensus_tolerance_px,
 )
-from services.matching.control_points import ChipSearch, PointMatches, match_points, with_matches
+from services.matching.control_points import (
+    ChipSearch,
+    MatchingOptions,
+    PointMatches,
+    match_points,
+    with_matches,
+)
 from services.matching.height_consensus import height_consensus
 from services.matching.predict import spread_over_image
 from services.quality.lack_of_fit import Elsewhere, are_contiguous, chance_of_contiguous
@@ -37,6 +43,8 @@ _MOST, _MOST_SHARE = 24, 0.25
 """Points that are searched again, well spread: so many, or this share of them where it is more."""
 _RADIUS_PX = 56
 """Search radius, pixels of the chips."""
+_VIEWS = 2
+"""Views of a point that are tried: what is beyond chance is the agreement of points, not of views."""
 _MAX_FALSE_ALARMS = 1e-3
 _MAX_FALSE_ALARMS_FAR = 1e-5
 """The same of points found far away: what moved or changed each by itself does not move evenly over the
@@ -103,11 +111,12 @@ def _search_elsewhere(
     beside = beside or _lines_beside(prediction, search, adjustment)
     if beside is not None:
         return beside
-    missed = _missed(search)
-    rows = _spread(context, prediction, search.rows[missed])
-    if len(rows) < _FEWEST:
+    if _missed(search).sum() < _FEWEST:
         return None
-    again = _Again(rows, _search_again(context, prediction, rows))
+    rows = _spread(context, prediction, search.rows[np.isin(search.matches.reason, UNFOUND)])
+    matching = context.options.matching
+    few = replace(matching, max_views=min(_VIEWS, matching.max_views))
+    again = _Again(rows, _search_again(context, prediction, rows, few))
     beside = _as_heights_move(context, prediction, search, adjustment, again)
     return beside or _far_away(context, prediction, again, _scatter_m(context, adjustment))
 
@@ -129,7 +138,7 @@ def _search_moved_ground(
     rows = np.flatnonzero(_missed(search))
     if len(rows) < _FEWEST:
         return search, adjustment
-    again = _search_again(context, prediction, search.rows[rows])
+    again = _search_again(context, prediction, search.rows[rows], context.options.matching)
     matches = with_matches(search.matches, rows, again)
     inliers, _ = select_inliers(prediction.model, search.points, matches)
     wider = replace(search, matches=matches, inliers=inliers)
@@ -137,13 +146,15 @@ def _search_moved_ground(
     return (wider, told) if told.moved else (search, adjustment)
 
 
-def _search_again(context: PointContext, prediction: Prediction, rows: IntArray) -> PointMatches:
+def _search_again(
+    context: PointContext, prediction: Prediction, rows: IntArray, matching: MatchingOptions
+) -> PointMatches:
     """Matches of points in a wide window."""
     chip_search = ChipSearch(
         context.image, prediction.model, context.scene.acquisition, context.fine_gsd_m, _RADIUS_PX
     )
     points = context.points.take(rows)
-    return match_points(chip_search, points, context.chips, context.options.matching)
+    return match_points(chip_search, points, context.chips, matching)
 
 
 def _on_moved_ground(
