@@ -67,6 +67,25 @@ def test_all_pixels_lost_are_filled_with_zeros() -> None:
     np.testing.assert_array_equal(filled(np.full((5, 7), np.inf, np.float32)), np.zeros((5, 7)))
 
 
+def test_a_gap_has_the_weighted_mean_of_the_valid_pixels_within_four() -> None:
+    """By the definition, at single gaps and in a large one; far from any valid pixel the mean of all."""
+    rng = np.random.default_rng(6)
+    pixels = rng.normal(100.0, 10.0, (30, 36)).astype(np.float32)
+    pixels[rng.random(pixels.shape) < 0.1] = np.nan
+    pixels[4:, 14:] = np.inf
+    pixels[20, 30] = 7.0
+    valid = np.isfinite(pixels)
+    expected = np.where(valid, pixels, pixels[valid].mean())
+    for i, j in np.argwhere(~valid):
+        lines, samples = np.nonzero(valid)
+        near = (np.abs(lines - i) <= 4) & (np.abs(samples - j) <= 4)
+        if near.any():
+            apart = (lines[near] - i) ** 2 + (samples[near] - j) ** 2
+            weight = np.exp(-0.5 * apart / 0.8**2)
+            expected[i, j] = weight @ pixels[lines[near], samples[near]] / weight.sum()
+    np.testing.assert_allclose(filled(pixels), expected, rtol=1e-6)
+
+
 @pytest.mark.parametrize("lost", [np.nan, np.inf])
 @pytest.mark.parametrize("ratio", [0.7, 1.0, 1.8, 2.5, 4.0, 9.0])
 def test_scattered_gaps_change_samples_little_and_lose_none(lost: float, ratio: float) -> None:

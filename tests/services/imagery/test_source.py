@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from services.geodesy import east_north_up, lon_lat_h_from_east_north_up
+from services.imagery.gaps import filled
 from services.imagery.source import (
     ArrayImage,
     CachedImage,
@@ -249,6 +250,22 @@ def test_a_reduction_consists_of_block_means_for_any_size_of_the_strips(
     assert reduced.factor == factor
     assert reduced.pixels.dtype == np.float32
     np.testing.assert_allclose(reduced.pixels, means, rtol=0.0, atol=500.0 * a_float32)
+
+
+@pytest.mark.parametrize("border", [0, 8, 9])
+@pytest.mark.parametrize("lost", [np.nan, np.inf])
+def test_blocks_beside_lost_ones_are_means_of_pixels_whose_gaps_are_filled(
+    border: int, lost: float
+) -> None:
+    """Blocks of two pixels a side, along a border that cuts through them or not, and with a gap."""
+    for gap in (False, True):
+        pixels = noise_image().pixels[:40, :40].copy()
+        pixels[:, :border] = lost
+        if gap:
+            pixels[21, 31] = lost
+        whole = filled(pixels).astype(np.float64).reshape(20, 2, 20, 2).mean(axis=(1, 3))
+        whole[:, : border // 2] = lost
+        np.testing.assert_allclose(block_means(pixels, 2), whole, rtol=1e-6)
 
 
 def test_a_block_is_lost_when_more_than_half_of_it_is() -> None:

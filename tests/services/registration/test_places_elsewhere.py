@@ -1,6 +1,6 @@
 """Points of a few lines that agree on another place than the scene are named, from five on."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -15,7 +15,15 @@ from services.registration.context import PointContext
 from services.registration.elsewhere import adjust_with_places
 from services.registration.options import RegistrationOptions
 from services.registration.search import Search, adjust_search, select_inliers
-from services.types import Acquisition, Array, BoolArray, ControlPoints, ViewMeasures, no_progress
+from services.types import (
+    Acquisition,
+    Array,
+    BoolArray,
+    ChipArray,
+    ControlPoints,
+    ViewMeasures,
+    no_progress,
+)
 from tests.factories import control_points
 from tests.services.conftest import GSD_M, SHAPE, FlatModel
 from tests.services.registration.small_ground import GSD_M as GRID_M
@@ -185,6 +193,36 @@ def test_two_tall_points_are_believed_where_the_ground_moves_with_its_relief(all
     if elsewhere is not None:
         assert elsewhere.slope_px is not None
         np.testing.assert_allclose(elsewhere.slope_px, SLOPE_PX, atol=0.01)
+
+
+@dataclass(frozen=True)
+class ChipsRead(MemoryChips):
+    """Chips that say which of them were read."""
+
+    rows: set[int] = field(default_factory=set)
+
+    def read(self, file: str, row: int, count: int) -> ChipArray:
+        self.rows.update(range(row, row + count))
+        return super().read(file, row, count)
+
+
+def test_only_points_that_were_not_found_are_searched_in_a_wide_window() -> None:
+    """Not those that were found and do not agree: their place is known."""
+    axis = 312.0 + np.linspace(60.0, 340.0, 8)
+    places_px = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    points, memory = points_at(places_px)
+    off_px = np.zeros((64, 2))
+    off_px[[5, 17, 30, 44, 60, 61], 0] = 4.0, -4.0, 4.0, -4.0, 4.0, -4.0
+    lost = np.array([0, 9, 26, 38, 47, 55])
+    lon_lat_h = whole().model.locate(places_px + off_px, np.arange(64.0) % 7)
+    chips = MemoryChips(memory.chips.copy())
+    chips.chips[lost] = chips.chips[np.roll(lost, 1)]
+    context, search = narrow_search(scene(np.zeros(2), 5.0), replace(points, lon_lat_h=lon_lat_h), chips)
+    np.testing.assert_array_equal(np.flatnonzero(search.matches.reason != ""), lost)
+    assert (~search.inliers).sum() == 12
+    read = ChipsRead(chips.chips)
+    assert elsewhere_of(replace(context, chips=read), search) is None
+    assert read.rows == set(lost.tolist())
 
 
 def test_lines_that_lie_far_from_the_others_are_found_in_a_wide_window() -> None:
