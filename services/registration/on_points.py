@@ -56,7 +56,7 @@ _FEWEST_REPEATED = 4
 takes can be repeated without some of them."""
 _AGREEING = 12
 """Points that agree on an image that is turned, at least, and half of those found."""
-_FEW_POINTS = 60
+_FEW_POINTS, _FEW_VIEWS = 60, 2
 _FEW_COARSE_POINTS = 2 * _AGREEING
 """Points that a coarse search for an image that is turned expects to see; chips that reach far are
 correlated in as many fewer pixels. Seven turns are searched, and few points agree by chance."""
@@ -130,7 +130,8 @@ def _how_it_is_turned(
 ) -> str:
     """How a scene that was not found is turned against its model; "" when it is not, as far as seen."""
     coarse = replace(options.coarse, points=min(_FEW_COARSE_POINTS, options.coarse.points))
-    few = replace(options, max_points=_FEW_POINTS, fine_stages=1, coarse=coarse)
+    matching = replace(options.matching, max_views=min(_FEW_VIEWS, options.matching.max_views))
+    few = replace(options, max_points=_FEW_POINTS, fine_stages=1, coarse=coarse, matching=matching)
     for words, turned in turned_scenes(scene):
         try:
             _, search, adjustment = search_scene(turned, points, chips, few)
@@ -167,11 +168,13 @@ def search_scene(
     )
     if needs_coarse_search(context, prediction):
         prediction = search_coarsely(context.part(0.0, 0.3), prediction)
-    context = replace(context, breaks=scene_breaks(scene))
     for stage, part in enumerate(context.parts(0.3, 0.6, options.fine_stages), start=1):
         rows = points_to_try(scene, points, prediction, options.max_points)
         last = stage == options.fine_stages
         search = _match(part, prediction, rows, strips=last)
+        if context.breaks is None:
+            context = replace(context, breaks=scene_breaks(scene))
+        search = replace(search, breaks=context.breaks)
         adjustment = adjust_search(scene, search, options.adjustment, ground_may_move=last)
         prediction = predict(scene, points, adjustment)
     return context, *search_missed_points(context, prediction, search, adjustment)
