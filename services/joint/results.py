@@ -27,6 +27,7 @@ from services.quality.stability import AdjustedScene, Repetition, stability_of
 from services.registration.on_points import Registration
 from services.registration.options import RegistrationOptions
 from services.registration.point_results import point_results
+from services.registration.search import shears_of_active
 from services.sensors.moving_pushbroom import AttitudeMotion, attitude_motion
 from services.sensors.pushbroom import PushbroomModel
 from services.types import Array, BoolArray, IntArray, Measures
@@ -198,6 +199,7 @@ def registered_scene(
         elsewhere=measured.elsewhere,
         control_gsd_m=measured.search.chip_side_m / CHIP_SIZE,
         breaks=measured.search.breaks,
+        shears=shears_of_active(measured.scene, measured.search, measures.active),
     )
 
     def of_scene(

@@ -18,6 +18,7 @@ from services.imagery.source import (
     sample_image,
 )
 from services.matching.chip_extent import central_square, visible_half_side
+from services.matching.chip_shears import ChipShears, chip_shears
 from services.matching.chip_strips import chip_strips
 from services.matching.correlate import (
     FOUND,
@@ -29,7 +30,7 @@ from services.matching.correlate import (
 )
 from services.matching.radiometry import gradient_image, mark_clouds, patch_statistics
 from services.matching.shadows import ShadowShift, shadow_shift
-from services.matching.systematic_error import common_covariance_px2
+from services.matching.systematic_error import common_covariance_px2, parallax_vectors
 from services.matching.view_combination import (
     ViewCombination,
     combine_views,
@@ -96,6 +97,8 @@ class PointMatches:
             `systematic_error`.
         view_measures: result of every view that was tried; its rows are those of the points.
         strips: how parts of the chips move against each other; None where it is not known.
+        shears: of the chips, by slopes that they and the scene see from different directions; None
+            where it is not known.
     """
 
     line_sample: Array
@@ -108,6 +111,7 @@ class PointMatches:
     common_covariance_m2: Array
     view_measures: ViewMeasures
     strips: ChipStrips | None = None
+    shears: ChipShears | None = None
 
 
 @dataclass(frozen=True)
@@ -122,7 +126,7 @@ class ChipSearch:
         radius_px: search radius, pixels of the chips.
         thresholds: of the correlation of grey values; None takes those of the options.
         half_side: of the part of each chip, around its point, that is searched, pixels of the chips.
-        strips: whether strips of the chips are compared, too, which show motion within the chips.
+        parts: whether parts of the chips are compared, too, which show motion within them and slopes.
     """
 
     image: ImageSource | ReducedImage
@@ -132,7 +136,7 @@ class ChipSearch:
     radius_px: int
     thresholds: PeakThresholds | None = None
     half_side: int = CHIP_CENTRE
-    strips: bool = True
+    parts: bool = True
 
 
 @dataclass(frozen=True)
@@ -226,7 +230,11 @@ def with_matches(matches: PointMatches, rows: IntArray, again: PointMatches) -> 
     strips = matches.strips
     if strips is not None and again.strips is not None:
         strips = strips.replaced(into, again.strips.take(of_them))
-    return replace(matches, view_measures=view_measures, strips=strips, **columns)
+    shears = matches.shears
+    if shears is not None and again.shears is not None:
+        anew = replace(again.shears, point=rows[again.shears.point])
+        shears = shears.replaced(into, anew)
+    return replace(matches, view_measures=view_measures, strips=strips, shears=shears, **columns)
 
 
 def _not_searched(reason: str) -> _PointMatch:
@@ -317,7 +325,8 @@ def _assembled(
         by_gradient=np.array([match.by_gradient for match in matches], dtype=bool),
         common_covariance_m2=_common_covariance_px2(search, points, matches, order) * search.gsd_m**2,
         view_measures=_view_measures(matches),
-        strips=_strips(search, points, matches) if search.strips else None,
+        strips=_strips(search, points, matches) if search.parts else None,
+        shears=_shears(points, matches) if search.parts else None,
     )
 
 
@@ -326,6 +335,23 @@ def _strips(search: ChipSearch, points: ControlPoints, matches: list[_PointMatch
     derivative = search.model.project_derivative(points.lon_lat_h)
     by_row_col = search.gsd_m * np.stack([-derivative[:, :, 1], derivative[:, :, 0]], axis=-1)
     return chip_strips([match.combination for match in matches], by_row_col)
+
+
+def _shears(points: ControlPoints, matches: list[_PointMatch]) -> ChipShears:
+    """How the chips of the views that agree are sheared in the scene."""
+    agreeing = [
+        (row, int(points.views.start[row] + match.views[k]), match.peaks[k])
+        for row, match in enumerate(matches)
+        for k in np.flatnonzero(match.combination.agreeing)
+        if not match.by_gradient
+    ]
+    view = np.array([view for _, view, _ in agreeing], dtype=np.int64)
+    incidence_deg = points.views.incidence_deg[view]
+    # An ortho-image states that it saw the ground from above; it is not how it was seen.
+    incidence_deg = np.where(incidence_deg == 0.0, np.nan, incidence_deg)
+    lean = -parallax_vectors(incidence_deg, points.views.azimuth_deg[view])
+    point = np.array([row for row, _, _ in agreeing], dtype=np.int64)
+    return chip_shears(point, lean, [peak for _, _, peak in agreeing])
 
 
 def _best_score(peaks: list[Peak]) -> float:

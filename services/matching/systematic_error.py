@@ -63,10 +63,10 @@ def common_covariance_px2(
     if not used.any():
         return covariance
     covariance += _image_variance_px2(views, row, offset, weight) * np.eye(2)
-    image = views.image[row[used]]
-    parallaxes = _parallax_vector(scene.incidence_deg, scene.azimuth_deg) - _parallax_vectors(
-        views, row[used]
-    )
+    rows = row[used]
+    image = views.image[rows]
+    of_scene = parallax_vectors(np.array(scene.incidence_deg), np.array(scene.azimuth_deg))
+    parallaxes = of_scene - parallax_vectors(views.incidence_deg[rows], views.azimuth_deg[rows])
     shadows = shadow_vector(scene) - np.array([shadow_vector(each) for each in views.images])[image]
     for difference, sigma_px, unknown_sigma_px in (
         (parallaxes, HEIGHT_SIGMA_PX, HEIGHT_SIGMA_PX),
@@ -126,13 +126,7 @@ def _student_factor(freedom: float) -> float:
     return freedom * (10.0 ** (2.0 / freedom) - 1.0) / math.log(100.0)
 
 
-def _parallax_vectors(views: Views, row: IntArray) -> Array:
-    """`_parallax_vector` (n, 2) of views (n,)."""
-    tangent, azimuth = np.tan(np.radians(views.incidence_deg[row])), np.radians(views.azimuth_deg[row])
-    return np.column_stack([tangent * np.sin(azimuth), tangent * np.cos(azimuth)])
-
-
-def _parallax_vector(incidence_deg: float, azimuth_deg: float) -> Array:
-    """East and north (2,) of the displacement towards the sensor by a unit of depth."""
-    azimuth = np.radians(azimuth_deg)
-    return np.tan(np.radians(incidence_deg)) * np.array([np.sin(azimuth), np.cos(azimuth)])
+def parallax_vectors(incidence_deg: Array, azimuth_deg: Array) -> Array:
+    """East and north (..., 2) of the displacements towards sensors (...) by a unit of depth."""
+    tangent, azimuth = np.tan(np.radians(incidence_deg)), np.radians(azimuth_deg)
+    return np.stack([tangent * np.sin(azimuth), tangent * np.cos(azimuth)], axis=-1)

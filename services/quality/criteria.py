@@ -167,6 +167,14 @@ _DESCRIPTIONS = {
         "deviations, as a share of the distance. 0 where it grows as much across the slope, or "
         "where no other view of the place explains it.",
     ),
+    "line_of_sight": _Description(
+        "Line of sight",
+        "deg",
+        1,
+        "Slopes shear the chips of a point against the scene, by how differently both see the ground. "
+        "Angle between the line of sight that shears of all chips imply and that of the model; 0 where "
+        "chance explains it (probability above 0.0001).",
+    ),
     "structure_within_chips": _Description(
         "Motion within the chips",
         "px",

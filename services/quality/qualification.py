@@ -21,6 +21,7 @@ from services.quality.lack_of_fit import (
     missed_criterion,
     structure_criteria,
 )
+from services.quality.line_of_sight import implied_sight, line_of_sight_criterion
 from services.quality.predicted import PredictedAccuracy, predict_accuracy
 from services.quality.stability import (
     AdjustedScene,
@@ -364,6 +365,7 @@ def _of_fit(scene: AdjustedScene, predicted_px: float) -> list[Criterion]:
     return [
         *structures,
         _against_slope(scene),
+        *_line_of_sight(scene),
         *_behind_breaks(scene),
         missed_criterion(
             "lines",
@@ -400,6 +402,15 @@ def _against_slope(scene: AdjustedScene) -> Criterion:
         measured = affine.apply(predicted) + measures.residual_px[measures.active]
     height_m = measures.lon_lat_h[measures.active, 2]
     return correction_against_height(measured - predicted, predicted, height_m, scene.gsd_m)
+
+
+def _line_of_sight(scene: AdjustedScene) -> list[Criterion]:
+    """The criterion on the line of sight of the model, where chips show shears."""
+    if scene.shears is None:
+        return []
+    derivative = scene.model.project_derivative(scene.measures.lon_lat_h[scene.shears.point])
+    lean = np.asarray(np.linalg.solve(derivative[:, :, :2], derivative[:, :, 2:])[:, :, 0], np.float64)
+    return [line_of_sight_criterion(implied_sight(scene.shears, lean))]
 
 
 def _whole(scene: AdjustedScene, expected: Array) -> BoolArray:

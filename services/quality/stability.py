@@ -7,6 +7,7 @@ import numpy as np
 
 from services.adjustment.image_correction import SceneAdjustment
 from services.errors import ComputationError
+from services.matching.chip_shears import ChipShears
 from services.quality.accuracy import Statistics, statistics
 from services.quality.lack_of_fit import Elsewhere
 from services.sensors.base import SensorModel
@@ -33,6 +34,7 @@ class AdjustedScene:
             0 where it was measured on none.
         breaks: first lines behind breaks of the image, where lines are missing or repeated; None where
             it was not looked for any.
+        shears: of the chips of active points, with their rows among all; None where it is not known.
     """
 
     model: SensorModel
@@ -45,6 +47,7 @@ class AdjustedScene:
     elsewhere: Elsewhere | None = None
     control_gsd_m: float = 0.0
     breaks: IntArray | None = None
+    shears: ChipShears | None = None
 
 
 Repetition = tuple[IntArray, SceneAdjustment | None]

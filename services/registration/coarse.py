@@ -135,7 +135,7 @@ def _search(
         radius_px,
         thresholds=PeakThresholds(options.coarse.min_score, max_second=1.0),
         half_side=half_side,
-        strips=False,
+        parts=False,
     )
     matches = match_points(chip_search, points, context.chips, options.matching, context.progress)
     consensus = first_consensus(

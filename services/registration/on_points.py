@@ -34,6 +34,7 @@ from services.registration.search import (
     predict,
     search_radius_px,
     select_inliers,
+    shears_of_active,
     summarise,
 )
 from services.registration.turned import turned_scenes
@@ -171,7 +172,7 @@ def search_scene(
     for stage, part in enumerate(context.parts(0.3, 0.6, options.fine_stages), start=1):
         rows = points_to_try(scene, points, prediction, options.max_points)
         last = stage == options.fine_stages
-        search = _match(part, prediction, rows, strips=last)
+        search = _match(part, prediction, rows, parts=last)
         if context.breaks is None:
             context = replace(context, breaks=scene_breaks(scene))
         search = replace(search, breaks=context.breaks)
@@ -180,9 +181,9 @@ def search_scene(
     return context, *search_missed_points(context, prediction, search, adjustment)
 
 
-def _match(context: PointContext, prediction: Prediction, rows: IntArray, *, strips: bool) -> Search:
+def _match(context: PointContext, prediction: Prediction, rows: IntArray, *, parts: bool) -> Search:
     """A search of some of the points with the fine chips, of which enough have to agree."""
-    search, tolerance_px = search_near(context, prediction, rows, strips=strips)
+    search, tolerance_px = search_near(context, prediction, rows, parts=parts)
     scene, stage = context.scene, context.stages[-1]
     lon_lat_h, measured = search.points.lon_lat_h, search.matches.line_sample
     predicted = prediction.model.project(lon_lat_h)
@@ -198,7 +199,7 @@ def _match(context: PointContext, prediction: Prediction, rows: IntArray, *, str
 
 
 def search_near(
-    context: PointContext, prediction: Prediction, rows: IntArray, *, strips: bool = True
+    context: PointContext, prediction: Prediction, rows: IntArray, *, parts: bool = True
 ) -> tuple[Search, float]:
     """A search of some of the points with the fine chips, within the error of their prediction.
 
@@ -206,7 +207,7 @@ def search_near(
         context: of the registration; the summary of the search is added to it.
         prediction: of all its points.
         rows: of the points to search.
-        strips: whether motion within the chips is looked for, which only the last search tells.
+        parts: whether parts of the chips are compared, too, which only the last search needs.
 
     Returns:
         The search, and the tolerance within which its inliers agree, pixels.
@@ -216,7 +217,7 @@ def search_near(
     error_m = largest_error_m(prediction.uncertainty_m[rows])
     radius_px = min(search_radius_px(error_m, gsd_m), options.coarse.max_search_px)
     chip_search = ChipSearch(
-        context.image, prediction.model, context.scene.acquisition, gsd_m, radius_px, strips=strips
+        context.image, prediction.model, context.scene.acquisition, gsd_m, radius_px, parts=parts
     )
     matches = match_points(chip_search, points, context.chips, options.matching, context.progress)
     inliers, tolerance_px = select_inliers(prediction.model, points, matches)
@@ -281,6 +282,7 @@ def build_registration(
         elsewhere,
         control_gsd_m=context.stages[-1].chip_gsd_m,
         breaks=context.breaks,
+        shears=shears_of_active(scene, search, measures.active),
     )
     rng = np.random.default_rng(options.seed)
     qualification = qualify(adjusted, options.qualification, rng)

@@ -14,6 +14,7 @@ from services.errors import NoConsensus, NotEnoughPoints
 from services.geodesy import continuous, ecef_from_east_north_up
 from services.imagery.scene import Scene, scene_centre, scene_gsd_m
 from services.imagery.source import image_gsds_m
+from services.matching.chip_shears import ChipShears
 from services.matching.consensus import (
     Consensus,
     Voters,
@@ -27,6 +28,7 @@ from services.registration.context import Candidate, NotFound, Prediction, Searc
 from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel
 from services.sensors.displacement import DisplacementGrid
+from services.sensors.ortho import OrthoModel
 from services.types import Array, BoolArray, ControlPoints, IntArray
 
 FIRST_TOLERANCE_PX = 3.0
@@ -103,6 +105,18 @@ def adjust_search(
         like=like,
         ground_may_move=ground_may_move,
     )
+
+
+def shears_of_active(scene: Scene, search: Search, active: BoolArray) -> ChipShears | None:
+    """The shears of chips of active points (n,), with their rows among all that the scene may show.
+
+    None for an ortho-image, whose relief is displaced by what its terrain lacked.
+    """
+    shears = search.matches.shears
+    if shears is None or isinstance(scene.model, OrthoModel):
+        return None
+    shears = replace(shears, point=search.rows[shears.point])
+    return shears.take(active[shears.point])
 
 
 def control_observations(scene: Scene, search: Search, usable: BoolArray) -> ControlObservations:
