@@ -29,6 +29,9 @@ _LEAN_SIGMA = 0.04
 _DEGREES_OF_FREEDOM = 3.0
 """Of the distribution of the misfits of points, of which some are far off."""
 _STEPS, _HALVINGS, _LONGEST_STEP, _SETTLED = 20, 4, 0.2, 1e-3
+_LARGEST_SIGMA_DEG, _LARGEST_LEAN = 6.0, 1.5
+"""Of a direction that is told: its largest standard deviation, and the tangent of the largest angle from
+the vertical at which images are taken."""
 _MAX_CHANCE = 1e-4
 """A direction beside that of the model that chance explains with a larger probability is none."""
 _LARGEST_DEG = 5.0
@@ -53,7 +56,7 @@ class ImpliedSight:
 
 
 def implied_sight(shears: ChipShears, lean: Array) -> ImpliedSight | None:
-    """The line of sight that shears of chips imply; None where too few points tell.
+    """The line of sight that shears of chips imply; None where they hardly tell.
 
     Least squares over the slopes of all points, the direction of the scene and a linear distortion of
     the image; robust (Student's distribution), because much of what shears a chip is no slope. The
@@ -70,18 +73,19 @@ def implied_sight(shears: ChipShears, lean: Array) -> ImpliedSight | None:
     if n < _FEWEST:
         return None
     views = np.diff(start, append=len(shears.point))
-    # Views of a point share the noise of the scene.
-    weight = 1.0 / (shears.sigma**2 + _LEAST_SIGMA**2) / np.repeat(views, views)
+    weight = 1.0 / (shears.sigma**2 + _LEAST_SIGMA**2)
     sheared = _Sheared(lean - shears.lean, shears.gradient, weight, start, views)
     offset, covariance = sheared.direction()
     covariance = n / (n - _UNKNOWNS) * covariance + _LEAN_SIGMA**2 * np.eye(2)
+    mean, sigma_deg = lean.mean(axis=0), np.degrees(np.sqrt(np.trace(covariance) / 2.0))
+    if not sigma_deg <= _LARGEST_SIGMA_DEG or np.hypot(*(mean + offset)) > _LARGEST_LEAN:
+        return None
     square = float(offset @ np.linalg.solve(covariance, offset))
-    mean = lean.mean(axis=0)
     of_model, implied = np.array([*mean, 1.0]), np.array([*(mean + offset), 1.0])
     cosine = of_model @ implied / np.linalg.norm(of_model) / np.linalg.norm(implied)
     return ImpliedSight(
         angle_deg=float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))),
-        sigma_deg=float(np.degrees(np.sqrt(np.trace(covariance) / 2.0))),
+        sigma_deg=float(sigma_deg),
         chance=float(np.exp(-square / 2.0)),
         points=n,
     )
