@@ -20,6 +20,9 @@ _FEWEST = 12
 _APART = 0.1
 """Tangent by which two views of such a point see it from different directions, at least: one view, or
 two that are alike, leave open whether a slope is steep or seen from the side."""
+_LARGEST_SHEAR = 0.05
+"""Of the chips of such a point: it displaces their borders by two pixels. The step of least squares from
+which shears come falls short of larger ones."""
 _SLOPE = 0.3
 """Slopes that are expected, one standard deviation: where scene and view see alike, nothing tells."""
 _LEAST_SIGMA = 0.002
@@ -66,7 +69,7 @@ def implied_sight(shears: ChipShears, lean: Array) -> ImpliedSight | None:
         shears: of views of points.
         lean: (v, 2) by which the model displaces ground at their points, see `ChipShears`.
     """
-    tells = _seen_differently(shears)
+    tells = _tell(shears)
     shears, lean = shears.take(tells), lean[tells]
     start = np.flatnonzero(np.diff(shears.point, prepend=-1))
     n = len(start)
@@ -91,13 +94,14 @@ def implied_sight(shears: ChipShears, lean: Array) -> ImpliedSight | None:
     )
 
 
-def _seen_differently(shears: ChipShears) -> BoolArray:
-    """Views (v,) of the points that views see from different directions."""
+def _tell(shears: ChipShears) -> BoolArray:
+    """Views (v,) of the points that views see from different directions, on gentle slopes."""
     count = np.maximum(np.bincount(shears.point), 1)
     mean = np.stack([np.bincount(shears.point, lean) / count for lean in shears.lean.T], axis=1)
-    away, farthest = np.hypot(*(shears.lean - mean[shears.point]).T), np.zeros(len(count))
-    np.maximum.at(farthest, shears.point, away)
-    return np.asarray(farthest[shears.point] >= _APART / 2.0)
+    away, largest = np.zeros(len(count)), np.zeros(len(count))
+    np.maximum.at(away, shears.point, np.hypot(*(shears.lean - mean[shears.point]).T))
+    np.maximum.at(largest, shears.point, np.linalg.norm(shears.gradient, axis=(1, 2)))
+    return np.asarray(((away >= _APART / 2.0) & (largest <= _LARGEST_SHEAR))[shears.point])
 
 
 @dataclass(frozen=True)
