@@ -1,4 +1,6 @@
-"""The model of another view is named as such, in whichever search its points do not agree."""
+"""The model of another view is named as such, in whichever search its points do not agree, or where
+they do.
+"""
 
 from dataclasses import replace
 
@@ -6,9 +8,13 @@ import numpy as np
 import pytest
 
 from services.errors import NoConsensus
+from services.production.from_images import produce_points
 from services.registration.on_points import register_scene
+from services.simulation.view import plan_geometry, simulate_block, simulate_view
+from services.simulation.world import make_world
 from services.types import Array
 from tests.services.registration.small_ground import points_at, scene, whole
+from tests.services.simulated import BLOCK_SIGMA_M, GSD_M, OPTIONS, SHAPE, MemoryChips, plan
 
 SIGMA_M = 12.0
 
@@ -37,3 +43,28 @@ def test_points_that_moved_each_by_itself_are_of_no_other_view(seed: int) -> Non
     said = refused(rng.uniform(-15.0, 15.0, (64, 2)), rng.uniform(0.0, 100.0, 64))
     assert "another view" not in said
     assert "--sigma-m" in said
+
+
+@pytest.mark.thorough
+def test_chips_over_gentle_ground_imply_the_line_of_sight_of_their_scene() -> None:
+    """Eight metres of relief, chips of four views; the scene is seen 11 degrees from the vertical."""
+    gentle = make_world(np.random.default_rng(3), size_m=1000.0, posting_m=1.0, relief_m=8.0)
+    views = simulate_block(
+        gentle,
+        np.random.default_rng(2),
+        n_views=4,
+        shape=SHAPE,
+        gsd_m=GSD_M,
+        error_m=BLOCK_SIGMA_M,
+        largest_incidence_deg=20.0,
+    )
+    made = produce_points([view.as_scene(BLOCK_SIGMA_M) for view in views], OPTIONS)
+    chips = MemoryChips(np.concatenate([made.chips(row) for row in range(len(made.points))]))
+    seen = simulate_view(gentle, plan(), np.random.default_rng(11), (3.0, -2.0)).as_scene(10.0)
+    for incidence_deg, met in ((11.0, True), (27.0, False), (33.0, False)):
+        other = plan_geometry(gentle, plan(incidence_deg=incidence_deg), np.random.default_rng(1))
+        result = register_scene(replace(seen, model=other.delivered), made.points, chips)
+        (sight,) = (c for c in result.qualification.criteria if c.name == "line_of_sight")
+        assert sight.met == met
+        assert result.qualification.verdict == ("good" if met else "failed")
+        assert sight.value == (0.0 if met else pytest.approx(incidence_deg - 11.0, abs=3.0))
