@@ -173,7 +173,7 @@ _DESCRIPTIONS = {
         1,
         "Slopes shear the chips of a point against the scene, by how differently both see the ground. "
         "Angle between the line of sight that shears of all chips imply and that of the model; 0 where "
-        "chance explains it (probability above 0.0001).",
+        "chance explains it (probability above 0.00001).",
     ),
     "structure_within_chips": _Description(
         "Motion within the chips",

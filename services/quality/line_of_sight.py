@@ -32,10 +32,11 @@ _LEAN_SIGMA = 0.04
 _DEGREES_OF_FREEDOM = 3.0
 """Of the distribution of the misfits of points, of which some are far off."""
 _STEPS, _HALVINGS, _LONGEST_STEP, _SETTLED = 20, 4, 0.2, 1e-3
-_LARGEST_SIGMA_DEG, _LARGEST_LEAN = 6.0, 1.5
+_LARGEST_SIGMA_DEG, _LARGEST_LEAN = 3.0, 1.5
 """Of a direction that is told: its largest standard deviation, and the tangent of the largest angle from
-the vertical at which images are taken."""
-_MAX_CHANCE = 1e-4
+the vertical at which images are taken. Where slopes hardly rise above the noise, what views share of it
+draws the direction aside."""
+_MAX_CHANCE = 1e-5
 """A direction beside that of the model that chance explains with a larger probability is none."""
 _LARGEST_DEG = 5.0
 """Largest angle between the lines of sight of a usable model and its image."""
