@@ -90,7 +90,9 @@ def _linear(influence: Array, leverage: Array) -> tuple[Array, Array]:
     flat = leverage.reshape(m, -1, 4).astype(np.float64)
     normal = (products @ flat).reshape(m, 3, 3, 2, 2).transpose(0, 1, 3, 2, 4).reshape(m, 6, 6)
     right = (basis @ influence.reshape(m, -1, 2)).reshape(m, 6)
-    regular = np.linalg.cond(normal) < 1e10
+    finite = np.isfinite(normal).all(axis=(1, 2)) & np.isfinite(right).all(axis=1)
+    normal[~finite] = 0.0
+    regular = finite & (np.linalg.cond(normal) < 1e10)
     gradient, unit = np.full((m, 2, 2), np.nan), np.full(m, np.nan)
     inverse = np.linalg.inv(normal[regular])
     by_row_col = (inverse @ right[regular][:, :, None]).reshape(-1, 3, 2)[:, 1:]

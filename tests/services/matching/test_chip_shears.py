@@ -1,5 +1,7 @@
 """Chips that a scene shows sheared against them are found so, with their precision."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -56,6 +58,15 @@ def test_views_of_unknown_direction_and_no_views_have_no_shears() -> None:
     shears = chip_shears(np.arange(2), lean, [peak_of(np.zeros((2, 2)), seed) for seed in range(2)])
     np.testing.assert_array_equal(shears.point, [0])
     assert not len(chip_shears(np.zeros(0, dtype=np.int64), np.empty((0, 2)), []).point)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 0.0])
+def test_a_chip_whose_squares_tell_nothing_has_no_shears(bad: float) -> None:
+    """It does not end the search of the others."""
+    peak = peak_of(np.zeros((2, 2)), 0)
+    leverage = np.full_like(peak.leverage, bad)
+    shears = chip_shears(np.arange(2), np.tile(LEAN, (2, 1)), [replace(peak, leverage=leverage), peak])
+    np.testing.assert_array_equal(shears.point, [1])
 
 
 def test_points_that_are_measured_anew_have_their_new_shears() -> None:
