@@ -16,7 +16,7 @@ PYTEST := $(BIN)/python -m pytest -p no:schemathesis --dist loadfile --no-loadsc
 APART := not endurance and not qgis
 LONG := cape_verde continent distorted faults image_selection load stress throughput block_adjustment toutin
 
-.PHONY: demo test test-thorough test-files test-operations test-shuffled test-fast test-security test-endurance test-qgis check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput mutants postgis page chromium pictures plugin
+.PHONY: demo test test-thorough test-files test-operations test-shuffled test-fast test-security test-endurance test-qgis check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput mutants postgis page chromium proxies pictures plugin
 
 demo: postgis
 	$(BIN)/amers demo
@@ -35,6 +35,7 @@ test-thorough: $(READY)
 # One after the other: Debian's packages are installed by one process at a time.
 programs: $(READY)
 	$(MAKE) postgis
+	$(MAKE) proxies
 	$(MAKE) page
 
 test-files: $(READY)
@@ -120,6 +121,9 @@ $(PAGE): $(wildcard web/* web/source/*) scripts/make-page
 
 chromium:
 	@scripts/ensure-chromium
+
+proxies:
+	@scripts/ensure-proxies
 
 $(READY): pyproject.toml constraints.txt scripts/make-venv
 	scripts/make-venv .venv
