@@ -3,7 +3,7 @@
 import errno
 import re
 
-from services.errors import AmersError, ComputationError, InputError
+from services.errors import AmersError, ComputationError, InputError, causes
 
 __all__ = [
     "AmersError",
@@ -103,19 +103,18 @@ def is_no_memory(error: BaseException) -> bool:
     Libraries report it in their own ways, by class, code or text: GDAL, OpenCV, libpq, C++. What the
     server of the database reports is the state of another process.
     """
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, MemoryError) or type(cause).__name__ == GDAL_NO_MEMORY:
-            return True
-        if isinstance(cause, OSError) and cause.errno == errno.ENOMEM:
-            return True
-        if type(cause).__module__ == "cv2" and getattr(cause, "code", None) == CV_NO_MEMORY:
-            return True
-        is_ours = isinstance(cause, AmersError) or getattr(cause, "sqlstate", None) is not None
-        if not is_ours and NO_MEMORY.search(str(cause)):
-            return True
-        cause = cause.__cause__ or cause.__context__
-    return False
+    return any(map(_says_no_memory, causes(error)))
+
+
+def _says_no_memory(error: BaseException) -> bool:
+    if isinstance(error, MemoryError) or type(error).__name__ == GDAL_NO_MEMORY:
+        return True
+    if isinstance(error, OSError) and error.errno == errno.ENOMEM:
+        return True
+    if type(error).__module__ == "cv2" and getattr(error, "code", None) == CV_NO_MEMORY:
+        return True
+    is_ours = isinstance(error, AmersError) or getattr(error, "sqlstate", None) is not None
+    return not is_ours and NO_MEMORY.search(str(error)) is not None
 
 
 class NotAllowed(AmersError):

@@ -19,6 +19,8 @@ AmersError
 Every message states the values found and expected.
 """
 
+from collections.abc import Iterator
+
 
 class AmersError(Exception):
     """Base of all errors whose message is shown to the user."""
@@ -89,3 +91,20 @@ class DoesNotFit(ComputationError):
 
 class NoConvergence(ComputationError):
     """An iteration did not converge."""
+
+
+def causes(error: BaseException) -> Iterator[BaseException]:
+    """Iterate over an error and all behind it, each once: cause, context, and members of groups.
+
+    They can form a ring: a library that raises a caught error from itself makes its own cause of it.
+    Nothing else walks from error to error.
+    """
+    waiting, met = [error], {id(error)}
+    while waiting:
+        one = waiting.pop()
+        yield one
+        members = one.exceptions if isinstance(one, BaseExceptionGroup) else ()
+        for behind in (*members, one.__context__, one.__cause__):
+            if behind is not None and id(behind) not in met:
+                met.add(id(behind))
+                waiting.append(behind)

@@ -201,6 +201,42 @@ def test_only_the_settings_read_the_environment():
     ]
 
 
+def walks_over_errors(tree: ast.AST) -> list[int]:
+    """The lines that follow links between errors, which can form a ring."""
+    named = {"__cause__", "__context__"}
+    return sorted(
+        node.lineno
+        for node in ast.walk(tree)
+        if (isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load) and node.attr in named)
+        or (isinstance(node, ast.Constant) and node.value in named)
+    )
+
+
+def test_one_function_walks_from_error_to_error():
+    """`services.errors.causes`, which meets each once; other code asks it."""
+    folders = ("app", "services", "migrations", "scripts", "benchmarks", "qgis_plugin", "mutants")
+    paths = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    walking = {path for path in paths if walks_over_errors(ast.parse(path.read_text()))}
+    assert walking == {ROOT / "services" / "errors.py"}
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "while error is not None:\n    error = error.__cause__",
+        "one = error.__cause__ or error.__context__",
+        "one = getattr(error, '__context__', None)",
+        "one = attrgetter('__cause__')(error)",
+    ],
+)
+def test_the_rule_finds_walks_over_errors(code):
+    assert walks_over_errors(ast.parse(code)) != []
+
+
+def test_the_rule_lets_an_error_get_its_cause():
+    assert walks_over_errors(ast.parse("error.__cause__ = caught\nraise error from caught")) == []
+
+
 def test_every_module_says_what_it_is_for_and_has_a_name_that_means_something():
     for path in modules():
         assert path.read_text()[:4].startswith(('"""', 'r"""')) or path.name == "__init__.py", path

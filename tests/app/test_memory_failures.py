@@ -94,3 +94,13 @@ def test_a_tile_that_memory_does_not_hold_is_no_damaged_file(tmp_path: Path):
     command = [sys.executable, "-c", READ_LITTLE, str(path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
     assert json.loads(done.stdout) == ["FormatError", True]
+
+
+@pytest.mark.parametrize("first", [RuntimeError("the connection is lost"), MemoryError()])
+def test_causes_that_form_a_ring_are_looked_at_once(first: Exception):
+    """SQLAlchemy raises the errors of a lost session from themselves."""
+    second = FormatError("a.tif: truncated or damaged")
+    first.__cause__, second.__cause__ = second, first
+    assert is_no_memory(second) is isinstance(first, MemoryError)
+    second.__cause__ = second
+    assert not is_no_memory(second)
