@@ -26,9 +26,9 @@ from app.errors import (
     StorageOutage,
     TooLarge,
     TooMany,
-    is_no_room,
 )
 from app.json_values import usable
+from app.outages import outage_of
 from app.usecases.damage import report_damage
 
 PROBLEM_JSON = "application/problem+json"
@@ -49,8 +49,8 @@ PROBLEM_TYPES: dict[type[Exception], str] = {
 }
 UNUSABLE = (None, "22003", "22021", "22P05")
 """SQLSTATEs of numbers and characters that PostgreSQL cannot store; None: the driver refused them."""
-RETRY_SECONDS = "5"
-HEADERS = {429: {"Retry-After": RETRY_SECONDS}}
+RETRY = {"Retry-After": "5"}
+HEADERS = {429: RETRY}
 
 log = logging.getLogger(__name__)
 
@@ -61,10 +61,8 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(DamagedFile, _damaged)
     app.add_exception_handler(RequestValidationError, _malformed)
     app.add_exception_handler(HTTPException, _not_routed)
-    app.add_exception_handler(psycopg.OperationalError, _unavailable)
-    app.add_exception_handler(psycopg.DataError, _unusable)
-    app.add_exception_handler(OSError, _no_room)
-    app.add_exception_handler(StorageOutage, _storage_unavailable)
+    for kind in (psycopg.Error, OSError, StorageOutage):
+        app.add_exception_handler(kind, _failed)
     app.add_exception_handler(Exception, _unexpected)
 
 
@@ -140,41 +138,29 @@ def _not_routed(request: Request, error: Exception) -> JSONResponse:
     return problem(error.status_code, str(error.detail), headers=headers)
 
 
+def _failed(request: Request, error: Exception) -> JSONResponse:
+    """The reply to an outage, to a value that no column can store, or to a bug."""
+    outage = outage_of(error)
+    if outage is None:
+        return _unusable(request, error)
+    what = f"{request.method} {request.url.path}: {outage.reason}"
+    if outage.again:
+        log.warning("%s", what)
+    else:
+        log.error("%s", what, exc_info=error)
+    detail = f"{outage.reason}; try again" if outage.again else outage.reason
+    return problem(outage.status, detail, headers=RETRY if outage.again else None)
+
+
 def _unusable(request: Request, error: Exception) -> JSONResponse:
-    """The reply to a value that no column can store, as a NUL in a text; other data errors are bugs."""
-    assert isinstance(error, psycopg.DataError)
-    if error.sqlstate not in UNUSABLE:
+    """The reply to a value that no column can store, as a NUL in a text; other errors are bugs."""
+    if not isinstance(error, psycopg.DataError) or error.sqlstate not in UNUSABLE:
         log.error("%s %s failed", request.method, request.url.path, exc_info=error)
         return _unexpected(request, error)
     first_line = str(error).partition("\n")[0]
     log.warning("%s %s: %s", request.method, request.url.path, first_line)
     detail = f"a value of this request cannot be used: {first_line}"
     return problem(400, detail, error=InvalidParameter.__name__)
-
-
-def _no_room(request: Request, error: Exception) -> JSONResponse:
-    log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-    if not is_no_room(error):
-        return _unexpected(request, error)
-    detail = "a disk of the service is full; no part of this request was stored: try again later"
-    return problem(507, detail, headers={"Retry-After": RETRY_SECONDS})
-
-
-def _unavailable(request: Request, error: Exception) -> JSONResponse:
-    if is_no_room(error):
-        return _no_room(request, error)
-    if isinstance(error, psycopg.errors.QueryCanceled):
-        return problem(503, "the request took the database too long and was stopped; ask for less")
-    return problem(
-        503, "the database does not answer; try again", headers={"Retry-After": RETRY_SECONDS}
-    )
-
-
-def _storage_unavailable(request: Request, error: Exception) -> JSONResponse:
-    log.warning("%s", error)
-    return problem(
-        503, "the storage of files does not answer; try again", headers={"Retry-After": RETRY_SECONDS}
-    )
 
 
 def _unexpected(request: Request, error: Exception) -> JSONResponse:
