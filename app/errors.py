@@ -3,7 +3,7 @@
 import errno
 import re
 
-from services.errors import AmersError, ComputationError, InputError, causes
+from services.errors import AmersError, ComputationError, InputError, causes_and_contexts
 
 __all__ = [
     "AmersError",
@@ -103,7 +103,7 @@ def is_no_memory(error: BaseException) -> bool:
     Libraries report it in their own ways, by class, code or text: GDAL, OpenCV, libpq, C++. What the
     server of the database reports is the state of another process.
     """
-    return any(map(_says_no_memory, causes(error)))
+    return any(map(_says_no_memory, causes_and_contexts(error)))
 
 
 def _says_no_memory(error: BaseException) -> bool:

@@ -13,14 +13,11 @@ Source: PostgreSQL documentation, appendix A, error codes.
 
 import errno
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from app.errors import AmersError, StorageOutage
-
-MOST_CAUSES = 20
-"""Errors of a lost session may name each other in a ring."""
+from services.errors import causes
 
 
 @dataclass(frozen=True)
@@ -152,7 +149,7 @@ def outage_of(error: BaseException) -> Outage | None:
 
     An error of Amers has its own message, whatever caused it.
     """
-    for cause in _causes(error):
+    for cause in causes(error):
         if isinstance(cause, AmersError):
             return None
         if (found := _outage(cause)) is not None:
@@ -189,16 +186,6 @@ def _of_database(error: BaseException) -> Outage | None:
     if found is not None and found.quotes:
         return replace(found, reason=f"{found.reason} ({_first_line(error)})")
     return found
-
-
-def _causes(error: BaseException) -> Iterator[BaseException]:
-    """An error and what it was raised from, no further than `MOST_CAUSES`."""
-    cause: BaseException | None = error
-    for _ in range(MOST_CAUSES):
-        if cause is None:
-            return
-        yield cause
-        cause = cause.__cause__
 
 
 def _is_of_driver(error: BaseException) -> bool:

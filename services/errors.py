@@ -94,17 +94,26 @@ class NoConvergence(ComputationError):
 
 
 def causes(error: BaseException) -> Iterator[BaseException]:
-    """Iterate over an error and all behind it, each once: cause, context, and members of groups.
+    """Iterate over an error and what it was raised from, each once, with the members of groups.
 
-    They can form a ring: a library that raises a caught error from itself makes its own cause of it.
-    Nothing else walks from error to error.
+    They can form a ring: a library that raises a caught error from itself makes it its own cause.
+    Nothing else than this module walks from error to error.
     """
+    return _walk(error, ("__cause__",))
+
+
+def causes_and_contexts(error: BaseException) -> Iterator[BaseException]:
+    """Iterate over an error, its causes, and what was being handled when they were raised, each once."""
+    return _walk(error, ("__context__", "__cause__"))
+
+
+def _walk(error: BaseException, links: tuple[str, ...]) -> Iterator[BaseException]:
     waiting, met = [error], {id(error)}
     while waiting:
         one = waiting.pop()
         yield one
         members = one.exceptions if isinstance(one, BaseExceptionGroup) else ()
-        for behind in (*members, one.__context__, one.__cause__):
+        for behind in (*members, *(getattr(one, link) for link in links)):
             if behind is not None and id(behind) not in met:
                 met.add(id(behind))
                 waiting.append(behind)

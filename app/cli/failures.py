@@ -6,6 +6,7 @@ import typer
 
 from app.cli.exit_status import FAILURE, REFUSED, exit_status
 from app.errors import AmersError, is_no_memory, is_no_room
+from app.outages import outage_of
 
 
 def failure(error: Exception) -> tuple[str, int]:
@@ -28,8 +29,10 @@ def _sentence(error: Exception) -> str:
         return f"{error.filename}: {error.strerror}; expected a place that this user can use"
     if _comes_from(error, "app.client.errors"):
         return f"{error}; see that the service answers at this address, then run the command again"
-    if isinstance(error, ConnectionError | TimeoutError) or _comes_from(error, "psycopg"):
-        return f"the database gave up: {error}; see its log and try the command again"
+    if (outage := outage_of(error)) is not None:
+        return f"{outage.reason}; run the command again" if outage.again else outage.reason
+    if isinstance(error, ConnectionError | TimeoutError):
+        return f"a connection broke: {error}; run the command again"
     return (
         f"an error that should not happen: {type(error).__name__}: {error}; set AMERS_LOG_LEVEL=debug "
         "to see where, and report it"

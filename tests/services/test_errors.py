@@ -2,7 +2,7 @@
 
 import pytest
 
-from services.errors import causes
+from services.errors import causes, causes_and_contexts
 
 
 def linked(*names: str) -> dict[str, Exception]:
@@ -12,13 +12,13 @@ def linked(*names: str) -> dict[str, Exception]:
 
 def names_of(error: BaseException) -> list[str]:
     """The errors of the walk from an error, each of which it meets once."""
-    return sorted(str(one) for one in causes(error))
+    return sorted(str(one) for one in causes_and_contexts(error))
 
 
 def test_a_chain_is_walked_from_the_error_to_its_first_cause():
     errors = linked("last", "middle", "first")
     errors["last"].__cause__, errors["middle"].__cause__ = errors["middle"], errors["first"]
-    assert [str(one) for one in causes(errors["last"])] == ["last", "middle", "first"]
+    assert [str(one) for one in causes_and_contexts(errors["last"])] == ["last", "middle", "first"]
 
 
 @pytest.mark.parametrize("link", ["__cause__", "__context__"])
@@ -48,7 +48,7 @@ def test_members_of_a_group_are_behind_it_and_so_is_what_caused_them():
     member.__cause__ = cause
     group = ExceptionGroup("group", [member, RuntimeError("other")])
     cause.__context__ = group
-    assert [str(one).partition(" (")[0] for one in causes(group)].count("group") == 1
+    assert [str(one).partition(" (")[0] for one in causes_and_contexts(group)].count("group") == 1
     assert {"member", "other", "cause"} <= set(names_of(group))
 
 
@@ -57,4 +57,11 @@ def test_a_chain_longer_than_the_stack_is_walked():
     for number in range(1, 20_000):
         last.__context__ = RuntimeError(str(number))
         last = last.__context__
-    assert sum(1 for _ in causes(first)) == 20_000
+    assert sum(1 for _ in causes_and_contexts(first)) == 20_000
+
+
+def test_what_was_only_being_handled_is_no_cause():
+    errors = linked("error", "cause", "handled")
+    errors["error"].__context__, errors["error"].__cause__ = errors["handled"], errors["cause"]
+    errors["cause"].__cause__ = errors["error"]
+    assert [str(one) for one in causes(errors["error"])] == ["error", "cause"]
