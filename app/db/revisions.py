@@ -1,5 +1,6 @@
 """Revisions of the schema: the one of a database, the one this Amers needs, and the upgrade."""
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,8 +12,11 @@ from typing import Any
 import psycopg
 
 from app.db.address import unreachable
+from app.db.preparation import prepare
 from app.db.sql_files import sql_file
 from app.errors import InputError
+
+log = logging.getLogger(__name__)
 
 DriverConnection = psycopg.Connection[tuple[Any, ...]]
 
@@ -67,12 +71,15 @@ def upgrade(dsn: str) -> None:
     """Apply the migrations that the database lacks; safe when several commands do it at once.
 
     Raises:
-        InputError: the database was upgraded by a newer Amers, or by another program.
+        InputError: the database was upgraded by a newer Amers, or by another program; or a superuser has
+            to prepare it.
     """
     from alembic import command
     from alembic.config import Config
 
     _refuse_foreign(status(dsn))
+    with driver_connection(dsn) as connection:
+        prepare(connection)
     config = Config()
     config.set_main_option("script_location", str(migrations_folder()).replace("%", "%%"))
     config.attributes["dsn"] = dsn
@@ -123,7 +130,13 @@ def _refuse_foreign(state: SchemaStatus) -> None:
 def _grant_reading(dsn: str) -> None:
     """Let the reading role read all tables, those of later migrations too."""
     with driver_connection(dsn) as connection:
+        connection.add_notice_handler(_log_warning)
         connection.execute(sql_file("grants.sql").encode())
+
+
+def _log_warning(notice: psycopg.errors.Diagnostic) -> None:
+    if notice.severity_nonlocalized == "WARNING":
+        log.warning("%s", notice.message_primary)
 
 
 @contextmanager

@@ -16,5 +16,8 @@ do $$ begin
     grant select on all tables in schema public to amers_reader;
     alter default privileges in schema public grant select on tables to amers_reader;
 exception when insufficient_privilege then
-    raise notice 'no role amers_reader: %', sqlerrm;
+    raise warning using message = format(
+        'requests are read, in read-only transactions, with the rights of %1$I, because it may not use the '
+        'role amers_reader: let a superuser run `create role amers_reader nologin` if there is none, and '
+        '`grant amers_reader to %1$I`, then run `amers db upgrade`', current_user);
 end $$;

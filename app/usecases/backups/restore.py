@@ -45,11 +45,9 @@ def restore_backup(
         raise InputError(f"{folder} is not as it was written, nothing is restored: {shown}")
     backup = sha256_of(folder / MANIFEST)
     is_continued = _is_begun(storage, backup)
-    has_database = archive.has_tables(dsn)
-    if has_database and not (is_continued and _is_restored(dsn, manifest)):
-        raise Conflict(
-            "the database has tables already: restore into an empty one (another AMERS_DATA_FOLDER)"
-        )
+    has_database = is_continued and _is_restored(dsn, manifest)
+    if not has_database:
+        archive.check_restorable(dsn, folder / ARCHIVE)
     storage.put(RESTORING, [backup.encode()])
     stored = [file for file in manifest.files if file.path.startswith(f"{STORAGE}/")]
     for number, file in enumerate(stored):
@@ -85,6 +83,8 @@ def _is_begun(storage: Storage, backup: str) -> bool:
 
 def _is_restored(dsn: str, manifest: Manifest) -> bool:
     """Whether a database is that of a backup."""
+    if not archive.has_tables(dsn):
+        return False
     with engine.connect(dsn) as connection:
         return installation.read(connection).id == manifest.installation
 
