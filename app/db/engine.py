@@ -35,9 +35,8 @@ from sqlalchemy.pool import ConnectionPoolEntry, PoolProxiedConnection
 
 from app import request_context
 from app.config import Settings
-from app.db.address import unreachable
 from app.db.ready import ready_database
-from app.db.revisions import DriverConnection, driver_connection
+from app.db.revisions import DriverConnection, driver_connection, reach
 
 Connection = sqlalchemy.Connection
 
@@ -166,11 +165,7 @@ def pooled(dsn: str, settings: Settings) -> Iterator[Database]:
 @contextmanager
 def connect(dsn: str) -> Iterator[Connection]:
     """A connection without a pool: one transaction, committed at the end of the context."""
-    try:
-        connection = _unpooled(dsn).connect()
-    except psycopg.OperationalError as error:
-        raise unreachable(error, dsn) from error
-    with connection:
+    with _unpooled(dsn).connect() as connection:
         set_origin(connection)
         yield connection
         connection.commit()
@@ -247,7 +242,8 @@ def _engine(dsn: str, **options: Any) -> Engine:
 def _unpooled(dsn: str) -> Engine:
     engine = create_engine(
         "postgresql+psycopg://",
-        creator=lambda: psycopg.connect(dsn, connect_timeout=10),
+        # What fails once there is a connection is a lost session, not an address that cannot be reached.
+        creator=lambda: reach(dsn),
         use_native_hstore=False,
         poolclass=NullPool,
     )

@@ -146,9 +146,17 @@ def driver_connection(dsn: str) -> Iterator[DriverConnection]:
     Raises:
         InputError: the database cannot be reached.
     """
+    with reach(dsn) as connection:
+        yield connection
+
+
+def reach(dsn: str) -> DriverConnection:
+    """A new connection of the driver.
+
+    Raises:
+        InputError: the database cannot be reached.
+    """
     try:
-        connection = psycopg.connect(dsn, connect_timeout=10)
+        return psycopg.connect(dsn, connect_timeout=10)
     except psycopg.OperationalError as error:
         raise unreachable(error, dsn) from error
-    with connection:
-        yield connection
