@@ -35,6 +35,7 @@ from app.api.routes import CallerRoute
 from app.db.engine import Connection
 from app.db.features.collection import Collection, Viewer
 from app.db.features.crs import CRS84
+from app.db.features.instants import format_moment
 from app.errors import NotAllowed
 from app.usecases.features import items
 from app.usecases.features.tiles import TILED
@@ -178,7 +179,7 @@ def describe(
             # STAC requires an extent even for a collection without features.
             spatial=SpatialExtent(bbox=[list(box or WORLD)], crs=CRS84.uri),
             temporal=TemporalExtent(
-                interval=[[None if time is None else time.isoformat() for time in period]]
+                interval=[[None if time is None else format_moment(time) for time in period]]
             ),
         ),
         links=_collection_links(request, collection),

@@ -12,11 +12,11 @@ from app.api.models.base import Link, stated_accuracy
 from app.api.models.jobs import JobError, Jobs, Message, Messages, StatusInfo
 from app.api.negotiation import JSON
 from app.api.routes import CallerRoute
+from app.db.features.instants import first_instant, last_instant, parse_interval
 from app.db.jobs.jobs import Job, JobFilter
 from app.db.schema import JobState
 from app.errors import NoSuchJob
 from app.usecases import jobs, results
-from app.usecases.features.query import parse_interval
 from app.usecases.media_types import media_type
 from app.usecases.processes import results_folder
 from app.usecases.results import delete_files
@@ -45,7 +45,7 @@ class JobsQuery(BaseModel):
     type: list[Literal["process"]] | None = Field(default=None, description="Every job is of this type.")
     datetime: str | None = Field(
         default=None,
-        description="Time of the request: a time, or an interval FROM/TO with `..` for an open end.",
+        description="When it was requested: a date, a time, or FROM/TO with `..` for an open end.",
     )
     min_duration: float | None = Field(default=None, alias="minDuration", ge=0, description="Seconds.")
     max_duration: float | None = Field(default=None, alias="maxDuration", ge=0, description="Seconds.")
@@ -59,8 +59,8 @@ class JobsQuery(BaseModel):
         return JobFilter(
             kinds=tuple(self.process_id or ()),
             states=tuple(self.status or ()),
-            since=since,
-            until=until,
+            since=None if since is None else first_instant(since),
+            until=None if until is None else last_instant(until),
             min_duration_s=self.min_duration,
             max_duration_s=self.max_duration,
         )

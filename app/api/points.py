@@ -23,6 +23,7 @@ from app.api.negotiation import (
 from app.api.point_page import point_page
 from app.api.routes import CallerRoute
 from app.db.features.collection import Viewer
+from app.db.features.instants import format_moment
 from app.db.point_detail import PointDetail, PointView
 from app.db.points import POINTS
 from app.usecases.features import points
@@ -154,4 +155,4 @@ def _feature(point: PointDetail, url: str) -> dict[str, Any]:
 
 def _plain(value: date | PointView) -> Any:
     """Dates, times and views as values that JSON has."""
-    return value.isoformat() if isinstance(value, date) else vars(value)
+    return format_moment(value) if isinstance(value, date) else vars(value)

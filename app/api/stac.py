@@ -5,6 +5,7 @@ Source: STAC API 1.0.0 (core, collections, ogcapi-features, item-search; filter 
 
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import datetime
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request, Response
@@ -47,6 +48,7 @@ from app.api.routes import CallerRoute
 from app.auth import Scope
 from app.db.engine import Database
 from app.db.features.collection import Viewer
+from app.db.features.instants import parse_interval
 from app.db.features.outlines import SCENES
 from app.errors import InvalidParameter
 from app.usecases.features import items as all_features
@@ -174,6 +176,20 @@ class SceneSearchBody(SceneSearch):
         return value
 
 
+def _check_instants(interval: str | None) -> None:
+    """Refuse what STAC search refuses: dates without a time of day, and an interval without any end.
+
+    Raises:
+        InvalidParameter: the interval is one of these; the message names it.
+    """
+    ends = (None, datetime.min) if interval is None else parse_interval(interval)
+    if ends == (None, None) or any(end is not None and not isinstance(end, datetime) for end in ends):
+        raise InvalidParameter(
+            f"datetime: {interval!r:.100} found; STAC search expects instants, such as"
+            " 2024-05-06T00:00:00Z/2024-05-06T23:59:59Z, and one known end at least"
+        )
+
+
 @needs(Scope.REGISTER)
 async def _scenes_viewer(caller: CallerDep, settings: SettingsDep) -> Viewer:
     return viewer_of(SCENES, caller, settings)
@@ -203,6 +219,7 @@ def search(
 ) -> Response:
     """Return a page of the scenes that meet the parameters, as STAC items."""
     refuse_unknown(request, parameter_names(SceneSearch) - NOT_SEARCHED)
+    _check_instants(query.datetime)
     resolved = _resolved(viewer, query, secret, query.restriction)
     return _page_reply(request, database, secret, resolved, _next_of_query(request))
 
@@ -233,6 +250,7 @@ def search_by_post(
     except ValidationError as error:
         wrong = (f"{'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors())
         raise InvalidParameter("; ".join(wrong)) from None
+    _check_instants(query.datetime)
 
     def next_link(token: str) -> dict[str, Any]:
         return {"href": str(request.url), "method": "POST", "body": {**body, "token": token}}

@@ -63,12 +63,13 @@ def test_a_file_of_points_opens_with_heights_reference_system_and_properties(get
 def test_a_span_of_time_holds_what_begins_or_ends_at_its_ends(get, connection):
     dates = run_sql(connection, "select min(first_view) as first, max(last_view) as last from point")
     edge = dates.fetchone()
-    day_before = edge["first"] - timedelta(days=1)
+    day_before, day_after = edge["first"] - timedelta(days=1), edge["last"] + timedelta(days=1)
     for span, holds in (
         (f"../{edge['first']}T00:00:00Z", "first"),
         (f"../{day_before}T23:59:59Z", None),
         (f"{edge['last']}T00:00:00Z/..", "last"),
-        (f"{edge['last']}T00:00:01Z/..", None),
+        (f"{edge['last']}T23:59:59Z/..", "last"),
+        (f"{day_after}T00:00:00Z/..", None),
     ):
         found = get(ITEMS, datetime=span, limit=100).json()["features"]
         assert bool(found) == (holds is not None), span

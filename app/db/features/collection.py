@@ -162,6 +162,11 @@ class Collection:
         return WITH_HEIGHT if self.has_height else FLAT
 
     @property
+    def geometry_nullable(self) -> bool:
+        """Whether features may lack a geometry."""
+        return not isinstance(self.geometry, Column) or bool(self.geometry.nullable)
+
+    @property
     def storage_crs(self) -> Crs:
         """The reference system of the stored geometries, and of replies unless asked otherwise."""
         return CRS84H if self.has_height else CRS84

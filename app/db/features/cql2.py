@@ -32,10 +32,11 @@ from sqlalchemy import (
 
 from app.db.constants import integer_constant
 from app.db.features.collection import Collection, Property
-from app.db.features.cql2_bounds import MOST_NODES, parse_geometry, parse_instant, parse_text
+from app.db.features.cql2_bounds import MOST_NODES, parse_geometry, parse_text
 from app.db.features.crs import CRS84, Crs
-from app.db.features.predicates import Condition, geometry_from_wkb, infinity, instant_of
-from app.db.schema.base import Double, Timestamp
+from app.db.features.instants import Moment, Time, parse_moment
+from app.db.features.predicates import Condition, geometry_from_wkb
+from app.db.schema.base import Double
 from app.errors import InvalidParameter
 
 GEOMETRY = ("geometry", "geom")
@@ -57,7 +58,7 @@ def _remainder(left: Expression, right: Expression) -> Expression:
     return cast(func.mod(cast(left, Numeric()), divisor), Double)
 
 
-COMPARISONS: Mapping[str, Callable[[Expression, Expression], Predicate]] = {
+COMPARISONS: Mapping[str, Callable[[Any, Any], Predicate]] = {
     "=": operator.eq,
     "<>": operator.ne,
     "<": operator.lt,
@@ -85,7 +86,7 @@ SPATIAL: Mapping[str, Callable[[Expression, Expression], Predicate]] = {
     "s_contains": func.st_contains,
 }
 # Of two intervals: the start and end of a, the start and end of b.
-TEMPORAL: Mapping[str, Callable[[Expression, Expression, Expression, Expression], Predicate]] = {
+TEMPORAL: Mapping[str, Callable[[Time, Time, Time, Time], Predicate]] = {
     "t_after": lambda a, a_end, b, b_end: a > b_end,
     "t_before": lambda a, a_end, b, b_end: a_end < b,
     "t_contains": lambda a, a_end, b, b_end: and_(a < b, a_end > b_end),
@@ -153,6 +154,11 @@ class _Value:
     kind: str
     property: Property | None = None
     literal: Any = None
+    is_date: bool = False
+
+    def operand(self) -> Expression | Time:
+        """What it is compared by."""
+        return Time(self.expression, self.is_date) if self.kind == "time" else self.expression
 
 
 class _Translator:
@@ -257,7 +263,7 @@ class _Translator:
             return self.collection.geometry.is_(None)
         return self._scalar(args[0]).expression.is_(None)
 
-    def _pair(self, left_node: Any, right_node: Any) -> tuple[Expression, Expression]:
+    def _pair(self, left_node: Any, right_node: Any) -> tuple[Any, Any]:
         """Two scalars that can be compared, each literal in the type of the other side."""
         left, right = self._scalar(left_node), self._scalar(right_node)
         left, right = self._in_type_of(right, left), self._in_type_of(left, right)
@@ -266,7 +272,7 @@ class _Translator:
                 f"filter: {_name(left_node)} is {left.kind} and {_name(right_node)} is {right.kind}:"
                 " they cannot be compared"
             )
-        return left.expression, right.expression
+        return left.operand(), right.operand()
 
     def _in_type_of(self, other: _Value, value: _Value) -> _Value:
         """A literal in the type of the property beside it: 0.7 of single precision, a date of a text."""
@@ -276,7 +282,7 @@ class _Translator:
         if item.type == "real" and value.kind == "number":
             return _Value(cast(value.expression, REAL()), "number")
         if item.is_time and value.kind == "text":
-            return self._instant(value.literal)
+            return _time(parse_moment(value.literal, "filter"))
         return value
 
     def _scalar(self, node: Any) -> _Value:
@@ -292,9 +298,9 @@ class _Translator:
             raise InvalidParameter(f"filter: a value expected, {json.dumps(node)!s:.60} found")
         if "property" in node:
             item = self._property(node["property"])
-            return _Value(*_expression(item), property=item)
+            return _Value(item.expression, _kind(item), property=item, is_date=item.type == "date")
         if "date" in node or "timestamp" in node:
-            return self._instant(node.get("date", node.get("timestamp")))
+            return _time_literal(node)
         self._enter()
         value = self._function(node)
         self.depth -= 1
@@ -348,25 +354,22 @@ class _Translator:
         _count(op, args, 2)
         return TEMPORAL[op](*self._interval(args[0]), *self._interval(args[1]))
 
-    def _interval(self, node: Any) -> tuple[Expression, Expression]:
+    def _interval(self, node: Any) -> tuple[Time, Time]:
         if isinstance(node, dict) and "interval" in node:
             ends = node["interval"]
             if not isinstance(ends, list) or len(ends) != 2:
                 raise InvalidParameter("filter: an interval has two ends")
-            return self._end(ends[0], infinity("-")), self._end(ends[1], infinity())
-        instant = self._end(node, infinity())
+            return self._end(ends[0], Time.unbounded("-")), self._end(ends[1], Time.unbounded())
+        instant = self._end(node, Time.unbounded())
         return instant, instant
 
-    def _end(self, node: Any, unbounded: Expression) -> Expression:
+    def _end(self, node: Any, unbounded: Time) -> Time:
         if node == "..":
             return unbounded
-        value = self._instant(node) if isinstance(node, str) else self._scalar(node)
+        value = _time(parse_moment(node, "filter")) if isinstance(node, str) else self._scalar(node)
         if value.kind != "time":
             raise InvalidParameter(f"filter: {_name(node)} is {value.kind}, a time expected")
-        return value.expression
-
-    def _instant(self, text: Any) -> _Value:
-        return _Value(literal(parse_instant(text, "filter"), Timestamp), "time")
+        return Time(value.expression, value.is_date)
 
     def _property(self, name: Any) -> Property:
         item = self.collection.queryables.get(name) if isinstance(name, str) else None
@@ -382,10 +385,27 @@ def _geometry_literal(collection: Collection, wkb: bytes) -> Expression:
     return geometry_from_wkb(literal(wkb, LargeBinary()), collection.storage_crs.srid)
 
 
-def _expression(item: Property) -> tuple[Expression, str]:
+def _kind(item: Property) -> str:
     if item.is_time:
-        return instant_of(item), "time"
-    return item.expression, "number" if item.is_number else item.type
+        return "time"
+    return "number" if item.is_number else item.type
+
+
+def _time(moment: Moment) -> _Value:
+    time = Time.of(moment)
+    return _Value(time.expression, "time", is_date=time.is_date)
+
+
+def _time_literal(node: dict[str, Any]) -> _Value:
+    """The value of `DATE(…)`, which holds a date, or of `TIMESTAMP(…)`, which holds a time."""
+    name = "date" if "date" in node else "timestamp"
+    value = _time(parse_moment(node[name], "filter"))
+    if value.is_date != (name == "date"):
+        expected = "2024-05-06" if name == "date" else "2024-05-06T07:08:09Z"
+        raise InvalidParameter(
+            f"filter: {name.upper()}: {node[name]!r:.60} found, such as {expected} expected"
+        )
+    return value
 
 
 def _is_collection(node: Any) -> bool:

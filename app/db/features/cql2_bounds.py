@@ -1,18 +1,18 @@
-"""Parsing of filters within limits of size: CQL2 in both languages, geometries, times.
+"""Parsing of filters within limits of size: CQL2 in both languages, geometries.
 
-Sources: OGC 21-065r2, Common Query Language (CQL2); RFC 7946, RFC 3339.
+Sources: OGC 21-065r2, Common Query Language (CQL2); RFC 7946.
 """
 
 import json
-from datetime import UTC, date, datetime
 from typing import Any
 
 import shapely
 
 from app.db.features.antimeridian import on_the_map
 from app.db.features.cql2_process import parse
-from app.db.features.cql2_tokens import check_text
+from app.db.features.cql2_tokens import check_text, check_times
 from app.db.features.crs import Crs, lon_lat_from_mercator
+from app.db.features.instants import parse_moment
 from app.errors import InvalidParameter
 
 LONGEST_JSON = 2_000_000
@@ -32,6 +32,7 @@ def parse_text(text: str) -> Any:
     """
     _check_unicode(text)
     check_text(text)
+    check_times(text)
     document = parse("text", text)
     check_size(document, "filter", DEEPEST_PARSED)
     return document
@@ -50,6 +51,7 @@ def parse_json(document: Any) -> Any:
     if isinstance(document, str):
         document = _loaded(document)
     check_size(document, "filter")
+    _check_times(document)
     try:
         text = json.dumps(document, ensure_ascii=False, allow_nan=False)
     except ValueError:
@@ -58,6 +60,23 @@ def parse_json(document: Any) -> Any:
     if len(text) > LONGEST_JSON:
         raise InvalidParameter(f"filter: {len(text)} characters of JSON, {LONGEST_JSON} at most")
     return parse("json", text)
+
+
+def _check_times(document: Any) -> None:
+    """As `check_times` of text, for a document that `check_size` has let through."""
+    parts = [document]
+    while parts:
+        part = parts.pop()
+        if isinstance(part, list):
+            parts += part
+        elif isinstance(part, dict):
+            parts += part.values()
+            ends = part.get("interval")
+            texts = [end for end in ends if isinstance(end, str)] if isinstance(ends, list) else []
+            texts += [part[name] for name in ("date", "timestamp") if name in part]
+            for text in texts:
+                if text != "..":
+                    parse_moment(text, "filter")
 
 
 def _loaded(text: str) -> Any:
@@ -111,28 +130,6 @@ def check_size(document: Any, where: str, deepest: int = DEEPEST_JSON) -> None:
         if not level:
             return
     raise InvalidParameter(f"{where}: deeper than {deepest} levels")
-
-
-def parse_instant(text: Any, where: str) -> datetime:
-    """The instant of a text in RFC 3339; a date is its first moment, UTC.
-
-    Raises:
-        InvalidParameter: the text is no time; the message names it and `where` it stood.
-    """
-    try:
-        if not isinstance(text, str) or len(text) > 40:
-            raise ValueError
-        # GDAL sends a date as `2024-05-06T`.
-        text = text.removesuffix("T")
-        if len(text) == 10:
-            day = date.fromisoformat(text)
-            return datetime(day.year, day.month, day.day, tzinfo=UTC)
-        instant = datetime.fromisoformat(text)
-    except ValueError:
-        raise InvalidParameter(
-            f"{where}: {text!r:.60} found, a date or time such as 2024-05-06T07:08:09Z expected"
-        ) from None
-    return instant if instant.tzinfo else instant.replace(tzinfo=UTC)
 
 
 def parse_geometry(node: Any, crs: Crs, where: str) -> bytes:

@@ -8,6 +8,7 @@ a text, a name or a number. The check reads each character once and does not rec
 import re
 from collections.abc import Iterator
 
+from app.db.features.instants import parse_moment
 from app.errors import InvalidParameter
 
 LONGEST_TEXT = 4_000
@@ -41,6 +42,8 @@ GEOMETRY = re.compile(
 DIMENSIONS = frozenset(("z", "m", "zm"))
 INFIX_WORDS = frozenset(("in", "like", "between", "is", "not", "null", "div"))
 JUNCTIONS = frozenset(("and", "or"))
+TEMPORAL = frozenset(("date", "timestamp", "interval"))
+UNBOUNDED = "'..'"
 
 
 def check_text(text: str) -> None:
@@ -58,6 +61,23 @@ def check_text(text: str) -> None:
     for token in _tokens(text):
         bounds.add(token)
     bounds.end()
+
+
+def check_times(text: str) -> None:
+    """Raise an error for a literal of time that is not in RFC 3339: the parser completes some.
+
+    Raises:
+        InvalidParameter: a literal is no time; the message names it.
+    """
+    name, functions = "", [""]
+    for token in _tokens(text):
+        if token["parenthesis"] == "(":
+            functions.append(name)
+        elif token["parenthesis"]:
+            functions.pop()
+        elif token["text"] and functions[-1] in TEMPORAL and token.group() != UNBOUNDED:
+            parse_moment(token.group()[1:-1], "filter")
+        name = token.group().lower() if token["name"] else ""
 
 
 def _tokens(text: str) -> Iterator[re.Match[str]]:

@@ -1,13 +1,11 @@
 """Conditions on the features of any collection: a box, a span of time, a filter."""
 
 from dataclasses import dataclass
-from datetime import datetime
 from typing import Any
 
 from sqlalchemy import (
     ARRAY,
     ColumnElement,
-    DateTime,
     Float,
     Text,
     and_,
@@ -21,10 +19,10 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import NullType
 
-from app.db.constants import integer_constant, text_constant
+from app.db.constants import integer_constant
 from app.db.features.bbox import Box
 from app.db.features.collection import Collection, Property
-from app.db.schema.base import Timestamp
+from app.db.features.instants import Moment, Time
 
 
 @dataclass(frozen=True)
@@ -88,6 +86,8 @@ class BoxShape:
 def box_predicate(collection: Collection, shape: BoxShape) -> ColumnElement[bool]:
     """The predicate that a feature meets a box: by the index, which is coarser, then exactly.
 
+    A feature without a geometry meets every box; the predicate asks only where some may have none.
+
     The exact part is wrapped in `coalesce`, which the planner does not look into. It would estimate that
     four comparisons with unknown values are very selective, and read the whole world for a first page.
 
@@ -113,7 +113,8 @@ def box_predicate(collection: Collection, shape: BoxShape) -> ColumnElement[bool
         parts.append(func.st_y(geometry).between(_number("south"), _number("north")))
     if shape.bounds_height:
         parts.append(height_predicate(collection))
-    return and_(or_(*near), func.coalesce(and_(*parts), false()))
+    inside = and_(or_(*near), func.coalesce(and_(*parts), false()))
+    return or_(geometry.is_(None), inside) if collection.geometry_nullable else inside
 
 
 def height_predicate(collection: Collection) -> ColumnElement[bool]:
@@ -129,35 +130,30 @@ def box_parameters(box: Box) -> dict[str, float]:
     return ends
 
 
-def in_time(collection: Collection, since: datetime | None, until: datetime | None) -> Condition:
-    """The condition that a feature's time meets an interval; None for an open end."""
+def in_time(collection: Collection, since: Moment | None, until: Moment | None) -> Condition:
+    """The condition that a feature's time meets an interval; None for an open end.
+
+    A feature without a time meets every interval, and so does an unknown end of its time on that side.
+    """
     if collection.interval is None:
         return ANYTHING
-    start, end = (instant_of(collection.queryables[name]) for name in collection.interval)
-    return Condition(
-        non_bbox_predicate=and_(
-            start <= (infinity() if until is None else literal(until, Timestamp)),
-            end >= (infinity("-") if since is None else literal(since, Timestamp)),
-        )
-    )
+    start, end = (collection.queryables[name] for name in collection.interval)
+    parts = []
+    if until is not None:
+        parts.append(_or_unknown(start, Time.of(start) <= Time.of(until)))
+    if since is not None:
+        parts.append(_or_unknown(end, Time.of(end) >= Time.of(since)))
+    return Condition(non_bbox_predicate=and_(*parts)) if parts else ANYTHING
+
+
+def _or_unknown(item: Property, predicate: ColumnElement[bool]) -> ColumnElement[bool]:
+    return or_(item.expression.is_(None), predicate) if item.nullable else predicate
 
 
 def key_among(collection: Collection, references: tuple[str, ...]) -> Condition:
     """The condition that the key of a feature, as text, is one of some texts."""
     key = cast(collection.key.expression, Text())
     return Condition(non_bbox_predicate=key == any_(literal(list(references), ARRAY(Text()))))
-
-
-def instant_of(item: Property) -> ColumnElement[Any]:
-    """A time as an instant; a date is its first moment, UTC."""
-    if item.type == "date":
-        return func.timezone(text_constant("UTC"), cast(item.expression, DateTime()), type_=Timestamp)
-    return item.expression
-
-
-def infinity(sign: str = "") -> ColumnElement[Any]:
-    """The instant after all others; before all others with the sign "-"."""
-    return cast(text_constant(f"{sign}infinity"), Timestamp)
 
 
 def meets_box(geometry: ColumnElement[Any], envelope: ColumnElement[Any]) -> ColumnElement[bool]:

@@ -8,6 +8,7 @@ from sqlalchemy import ColumnElement, Text, cast, func
 from app.db.constants import integer_constant, text_constant
 from app.db.features.collection import Property
 from app.db.features.crs import from_storage, in_own_order
+from app.db.features.instants import time_text
 from app.db.features.query import Layout, Selection
 
 DEGREE_DIGITS = 9
@@ -66,7 +67,7 @@ def csv_text(layout: Layout) -> ColumnElement[str]:
 
 
 def _json(item: Property) -> ColumnElement[Any]:
-    value = item.expression
+    value = plain_value(item)
     if not item.is_number and item.type != "boolean":
         value = func.to_json(value)
     if item.nullable:
@@ -83,7 +84,5 @@ def _csv(item: Property) -> ColumnElement[str]:
 
 
 def plain_value(item: Property) -> ColumnElement[Any]:
-    """A value of the few types that files of all formats have: dates are text in ISO 8601."""
-    if item.is_time:
-        return func.to_json(item.expression).op("#>>")(text_constant("{}"))
-    return item.expression
+    """A value of the few types that texts of all formats have: dates and times are text in RFC 3339."""
+    return time_text(item) if item.is_time else item.expression

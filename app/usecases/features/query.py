@@ -9,7 +9,6 @@ import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import datetime
 from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
@@ -18,8 +17,9 @@ from app.db.features.bbox import Box
 from app.db.features.collection import Collection, Property, Viewer
 from app.db.features.counts import Count
 from app.db.features.cql2 import geometry_condition, translate, translate_text
-from app.db.features.cql2_bounds import check_size, parse_instant, parse_json
+from app.db.features.cql2_bounds import check_size, parse_json
 from app.db.features.crs import CRS84, EARTH_RADIUS_M, EVERY, Crs
+from app.db.features.instants import parse_interval
 from app.db.features.predicates import ANYTHING, Condition, in_time, key_among
 from app.db.features.query import Key, Order, Selection
 from app.errors import InvalidParameter
@@ -61,13 +61,15 @@ class FeatureFilter(BaseModel):
     bbox: Bbox | None = Field(
         default=None,
         description="Box W,S,E,N, or with heights W,S,LOWEST,E,N,HIGHEST; W greater than E crosses the"
-        " antimeridian.",
+        " antimeridian. Features without a geometry meet every box.",
     )
     bbox_crs: str | None = Field(
         default=None, alias="bbox-crs", description="URI of the coordinate reference system of `bbox`."
     )
     datetime: str | None = Field(
-        default=None, description="A time, or an interval FROM/TO with `..` for an open end."
+        default=None,
+        description="A date, a time, or an interval FROM/TO with `..` for an open end, as RFC 3339 has"
+        " them. A date is a whole day, UTC. Features without a time meet all of them.",
     )
     filter: str | dict[str, Any] | None = Field(
         default=None, description="CQL2: text, or JSON in the body of a POST."
@@ -292,25 +294,6 @@ def _from_mercator(east_m: float, north_m: float) -> list[float]:
     lon = max(-180.0, min(180.0, math.degrees(east_m / EARTH_RADIUS_M)))
     north_m = max(-4.0 * limit_m, min(4.0 * limit_m, north_m))
     return [lon, math.degrees(math.atan(math.sinh(north_m / EARTH_RADIUS_M)))]
-
-
-def parse_interval(text: str) -> tuple[datetime | None, datetime | None]:
-    """Start and end of an instant or an interval `FROM/TO`; None for an open end (`..` or no text).
-
-    Raises:
-        InvalidParameter: the text is neither a time nor an interval.
-    """
-    ends = text.split("/")
-    if len(ends) > 2 or not text or ends == ["", ""]:
-        raise InvalidParameter(f"datetime: {text!r:.100} found, a time or FROM/TO expected")
-    low, high = (None if end in ("", "..") else parse_instant(end, "datetime") for end in (ends * 2)[:2])
-    if len(ends) == 1 and low is None:
-        raise InvalidParameter(f"datetime: {text!r:.100} found, a time or FROM/TO expected")
-    if low and high and low > high:
-        raise InvalidParameter(f"datetime: {ends[0]} is after {ends[1]}")
-    if high and len(ends[-1]) == 10:
-        high = high.replace(hour=23, minute=59, second=59, microsecond=999_999)
-    return low, high
 
 
 def crs_of(parameter: str, uri: str | None, collection: Collection | None) -> Crs:
