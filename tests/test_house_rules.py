@@ -309,3 +309,12 @@ def test_the_rule_finds_sql_that_is_put_together(module):
 )
 def test_the_rule_lets_sql_pass_that_is_not_put_together(module):
     assert Source(ast.parse(module)).violations() == []
+
+
+def test_one_function_makes_the_command_of_a_python_process():
+    """Another could look for modules in the working folder, where deliveries are unpacked."""
+    starting = re.compile(
+        r"sys\.executable|ProcessPoolExecutor\(|multiprocessing\.Process|os\.(exec|spawn)"
+    )
+    places = {str(path.relative_to(ROOT)) for path in modules() if starting.search(path.read_text())}
+    assert places == {"app/child_processes.py", "app/usecases/executors.py"}

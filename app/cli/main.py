@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from app.child_processes import leave_out_working_folder
 from app.cli.commands import COMMANDS
 from app.cli.exit_status import FAILURE, INTERRUPTED, REFUSED
 from app.cli.failures import failure, print_traceback
@@ -55,6 +56,7 @@ def amers(
 def main() -> None:
     """Run one command; an error is printed as one sentence, without a traceback."""
     use_one_thread()
+    leave_out_working_folder()
     gc.set_threshold(OBJECTS_BEFORE_COLLECTION)
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) == signal.SIG_DFL:

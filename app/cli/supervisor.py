@@ -4,12 +4,13 @@ import logging
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import FrameType
+
+from app.child_processes import python_command
 
 PROGRAM = """
 import ctypes, os, sys
@@ -56,7 +57,7 @@ class Child:
         own = (str(os.getpid()), str(int(self.death_signal)))
         program = PROGRAM.format(statement=self.statement)
         return subprocess.Popen(
-            (sys.executable, "-c", program, *self.arguments, *own),
+            python_command("-c", program, *self.arguments, *own),
             stdin=subprocess.DEVNULL,
             start_new_session=True,
             pass_fds=self.descriptors,

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+from app.child_processes import leave_out_working_folder
 from app.errors import InputError
 from app.one_thread import use_one_thread
 
@@ -44,6 +45,7 @@ def open_executor(options: ComputeOptions) -> Iterator[tuple[Executor, int]]:
             yield thread, 1
         return
     use_one_thread()
+    leave_out_working_folder()
     # Children that are forked from threads may lock up.
     context = multiprocessing.get_context("forkserver")
     with ProcessPoolExecutor(options.jobs, mp_context=context, initializer=_begin_process) as pool:

@@ -7,12 +7,12 @@ import select
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from types import TracebackType
 
+from app.child_processes import SAFE_PATH, python_command
 from app.one_thread import ONE_THREAD
 
 LIMITED_LIBRARIES = {
@@ -82,7 +82,7 @@ class WarmServer:
 
     def __init__(self, environment: Mapping[str, str]) -> None:
         """Start to load the server; `environment` is added to that of its processes."""
-        self._environment = os.environ | LIMITED_LIBRARIES | dict(environment)
+        self._environment = SAFE_PATH | os.environ | LIMITED_LIBRARIES | dict(environment)
         self._process: subprocess.Popen[bytes] | None = None
         self._control: socket.socket | None = None
         self._launch()
@@ -145,7 +145,7 @@ class WarmServer:
             self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             with theirs:
                 self._process = subprocess.Popen(
-                    [sys.executable, "-m", "app.worker.warm_server", str(theirs.fileno())],
+                    python_command("-m", "app.worker.warm_server", str(theirs.fileno())),
                     env=self._environment,
                     stdin=subprocess.DEVNULL,
                     pass_fds=[theirs.fileno()],

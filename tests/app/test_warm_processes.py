@@ -17,11 +17,13 @@ from tests.app.worker_processes import alive, kill, wait_until
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 PATIENCE_S = 120.0
+HERE = {"PYTHONPATH": os.getcwd()}
+"""Where these processes find the functions of tests: not in the working folder by themselves."""
 FUNCTIONS = "tests.app.warm_functions"
 LONELY = """
-import sys, time
+import os, sys, time
 from app.worker.warm_process import WarmServer
-server = WarmServer({})
+server = WarmServer({"PYTHONPATH": os.getcwd()})
 process = server.start("tests.app.warm_functions:sleep_with_a_child", [sys.argv[1]], {})
 time.sleep(600)
 """
@@ -30,7 +32,7 @@ time.sleep(600)
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[WarmServer]:
-    with WarmServer({}) as running:
+    with WarmServer(HERE) as running:
         yield running
 
 
@@ -122,7 +124,7 @@ def test_a_killed_process_has_the_code_of_its_signal_and_others_go_on(
 def test_a_killed_server_takes_its_processes_along_and_the_next_one_gets_a_new_server(
     tmp_path: Path,
 ) -> None:
-    with WarmServer({}) as server:
+    with WarmServer(HERE) as server:
         process = server.start(f"{FUNCTIONS}:sleep_with_a_child", [str(tmp_path / "pids")], {})
         pid, _ = started(process, tmp_path / "pids")
         assert server.pid is not None
@@ -134,7 +136,7 @@ def test_a_killed_server_takes_its_processes_along_and_the_next_one_gets_a_new_s
 
 
 def test_a_process_that_is_closed_while_the_server_loads_never_starts(tmp_path: Path) -> None:
-    with WarmServer({}) as server:
+    with WarmServer(HERE) as server:
         process = server.start(f"{FUNCTIONS}:describe", [str(tmp_path / "facts")], {})
         began = time.monotonic()
         process.close()

@@ -11,11 +11,11 @@ import queue
 import signal
 import socket
 import subprocess
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from app.child_processes import python_command
 from app.errors import InvalidParameter, TooMany
 
 PROCESSES = 2
@@ -83,7 +83,7 @@ class _Process:
         # starts it, which may end long before. A parse that never ends is left to its limit of CPU.
         with theirs:
             self.process = subprocess.Popen(
-                (sys.executable, "-I", "-S", str(PROGRAM), str(Path(spec.origin).parent.parent)),
+                python_command("-I", "-S", str(PROGRAM), str(Path(spec.origin).parent.parent)),
                 stdin=theirs.fileno(),
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
