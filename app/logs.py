@@ -1,6 +1,7 @@
 """The log on standard error: one line per event, for people (key=value) or for programs (JSON).
 
-Every line has the request, the job and the caller it belongs to, where they are known.
+Every line has the request, the job and the caller it belongs to, where they are known. No line
+has a control character, whatever the texts of callers and files are: escapes stand for them.
 """
 
 import json
@@ -10,6 +11,7 @@ from typing import Any, Literal
 
 from app import request_context
 from app.config import Settings
+from app.printable import printable, printable_json
 
 Format = Literal["text", "json"]
 
@@ -43,17 +45,17 @@ class Lines(logging.Formatter):
         self._form = form
 
     def format(self, record: logging.LogRecord) -> str:
-        """One line; a traceback is a field of a JSON line, and follows a text line."""
+        """One line; a traceback is a field of a JSON line, and follows a text line, indented."""
         fields = _fields(record)
         trace = self.formatException(record.exc_info) if record.exc_info else None
         if self._form == "json":
             if trace:
                 fields["trace"] = trace
-            return json.dumps(fields, default=str, ensure_ascii=False)
+            return printable_json(json.dumps(fields, default=str, ensure_ascii=False))
         time_, level, logger, message = (str(fields.pop(name)) for name in _FIRST)
         rest = "".join(f" {name}={_quoted(value)}" for name, value in fields.items())
-        line = f"{time_} {level} {logger}: {_one_line(message)}{rest}"
-        return f"{line}\n{trace}" if trace else line
+        line = printable(f"{time_} {level} {logger}: {_one_line(message)}{rest}")
+        return f"{line}\n{_indented(trace)}" if trace else line
 
 
 _FIRST = ("time", "level", "logger", "message")
@@ -82,3 +84,8 @@ def _quoted(value: object) -> str:
 def _one_line(message: str) -> str:
     """A message without line breaks: text that a caller sent must not look like a log line."""
     return message.replace("\r", "\\r").replace("\n", "\\n")
+
+
+def _indented(trace: str) -> str:
+    """A traceback none of whose lines looks like a line of the log: the error may quote a caller."""
+    return "\n".join(f"    {printable(line)}" for line in trace.split("\n"))

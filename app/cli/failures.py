@@ -7,6 +7,7 @@ import typer
 from app.cli.exit_status import FAILURE, REFUSED, exit_status
 from app.errors import AmersError, is_no_memory, is_no_room
 from app.outages import outage_of
+from app.printable import printable
 
 
 def failure(error: Exception) -> tuple[str, int]:
@@ -57,4 +58,4 @@ def _usage(error: typer.TyperException) -> str:
 
 
 def _one_line(text: object) -> str:
-    return " ".join(str(text).split())
+    return printable(" ".join(str(text).split()))

@@ -12,6 +12,8 @@ from uuid import UUID
 
 import typer
 
+from app.printable import printable
+
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 Row = Mapping[str, object]
@@ -64,7 +66,7 @@ def as_text(value: object) -> str:
         return value.isoformat(sep=" ", timespec="seconds")
     if isinstance(value, list | tuple | set | frozenset):
         return ", ".join(map(as_text, value))
-    return str(value)
+    return printable(str(value))
 
 
 def _field_name(name: str) -> str:
@@ -74,7 +76,7 @@ def _field_name(name: str) -> str:
 
 def _field(value: object) -> str:
     """A value on one line without tabs."""
-    return re.sub(r"\s", " ", as_text(value))
+    return as_text(value)
 
 
 def as_size(size_bytes: int) -> str:

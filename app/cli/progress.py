@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 
+from app.printable import printable
 from services.types import Progress
 
 
@@ -23,7 +24,7 @@ def shown_progress() -> Iterator[Progress]:
         task = bar.add_task("", total=1.0)
 
         def report(fraction: float, message: str) -> None:
-            bar.update(task, completed=fraction, description=message)
+            bar.update(task, completed=fraction, description=printable(message))
 
         yield report
 
@@ -36,6 +37,6 @@ def _lines() -> Progress:
         tenth = int(fraction * 10.0)
         if tenth > last_tenth:
             last_tenth = tenth
-            typer.echo(f"{10 * tenth:3d} % {message}", err=True)
+            typer.echo(f"{10 * tenth:3d} % {printable(message)}", err=True)
 
     return report
