@@ -10,6 +10,7 @@ from typing import Literal
 
 import psycopg
 
+from app.config import Settings
 from app.db import engine, revisions
 from app.db.engine import Connection
 from app.db.jobs import progress
@@ -24,6 +25,10 @@ STORAGE_LIMIT_S = 5.0
 """A storage that takes longer to write and read a tiny file does not answer."""
 PROBE = "probe.txt"
 """Key of the tiny file; top-level keys belong to no block, scene or job."""
+SILENT_SHARE = 0.1
+"""Share of the time limit of a job for which its process may report nothing."""
+STILL_LEASES = 3
+"""A lost ticket is replaced, and the job of a dead worker taken over, within two leases."""
 NEEDED_TO_READ = ("database", "schema", "storage")
 
 State = Literal["ok", "degraded", "failed"]
@@ -77,7 +82,11 @@ class Readiness:
         try:
             with self._installation.database.reading() as connection:
                 engine.check_postgis(connection)
-                parts = {"database": OK, "schema": _schema(connection), "worker": _worker(connection)}
+                parts = {
+                    "database": OK,
+                    "schema": _schema(connection),
+                    "worker": _worker(connection, self._installation.settings),
+                }
         except psycopg.Error:
             parts = {"database": Part("failed", "the database does not answer")}
         return {**parts, "storage": self._storage(), "disk": _disk(self._installation)}
@@ -109,10 +118,29 @@ def _schema(connection: Connection) -> Part:
     )
 
 
-def _worker(connection: Connection) -> Part:
-    if progress.count_workers(connection):
-        return OK
-    return Part("degraded", "no worker is alive: jobs wait until `amers worker` runs")
+def _worker(connection: Connection, settings: Settings) -> Part:
+    """Workers are alive, the jobs that run report progress, and those that wait are claimed."""
+    jobs = progress.movement(connection, settings.jobs_running_per_owner)
+    if not jobs.workers:
+        return Part("degraded", "no worker is alive: jobs wait until `amers worker` runs")
+    longest_s = SILENT_SHARE * settings.job_seconds
+    if jobs.silent_s > longest_s:
+        return Part(
+            "degraded",
+            f"job {jobs.silent_job} runs and has reported no progress for {jobs.silent_s:.0f} s, more "
+            f"than {SILENT_SHARE:.0%} of AMERS_JOB_SECONDS ({longest_s:g} s): see the worker's log, "
+            f"and dismiss the job (DELETE /jobs/{jobs.silent_job}) if it does not go on",
+        )
+    idle, longest_s = jobs.workers - jobs.running, STILL_LEASES * settings.lease_seconds
+    if idle > 0 and jobs.still_s > longest_s:
+        return Part(
+            "degraded",
+            f"the queue does not move: {jobs.claimable} jobs wait, job {jobs.first_job} for "
+            f"{jobs.still_s:.0f} s, more than {STILL_LEASES} times AMERS_LEASE_SECONDS "
+            f"({longest_s:g} s), and {idle} of {jobs.workers} workers have nothing to do: see their "
+            "logs, and restart them",
+        )
+    return OK
 
 
 def _storage(installation: Installation) -> Part:

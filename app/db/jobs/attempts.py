@@ -71,12 +71,13 @@ def claim_next(
 
 
 def renew(connection: Connection, job_id: UUID, attempt: int, lease_s: float) -> None:
-    """Extend the lease of an attempt.
+    """Extend the lease of an attempt: its worker lives; only its process moves `updated_at`.
 
     Raises:
         LostJob: the attempt is over.
     """
-    _write(connection, job_id, attempt, lease_until=clock + timedelta(seconds=lease_s))
+    until = clock + timedelta(seconds=lease_s)
+    _write(connection, job_id, attempt, lease_until=until, updated_at=job.c.updated_at)
 
 
 def report(connection: Connection, job_id: UUID, attempt: int, percent: int, message: str) -> None:
@@ -264,7 +265,7 @@ def _write(connection: Connection, job_id: UUID, attempt: int, **values: Any) ->
     written = connection.execute(
         update(job)
         .where(job.c.id == job_id, job.c.attempt == attempt, job.c.state == "running")
-        .values(**values, updated_at=clock)
+        .values(**{"updated_at": clock, **values})
     )
     if written.rowcount != 1:
         raise LostJob(f"attempt {attempt} of job {job_id} is over")

@@ -7,7 +7,7 @@ from uuid import UUID
 from sqlalchemy import select
 
 from app.db.engine import Connection
-from app.db.rows import columns_of, every, first
+from app.db.rows import columns_of, every, first, only
 from app.db.schema import job_message
 from app.db.statements import named
 
@@ -17,6 +17,7 @@ BEATING_S = 30
 """A worker of the queue gives a sign of life every ten seconds; one silent for longer does not count."""
 
 COUNT_WORKERS = named("jobs.sql", "count_workers")
+MOVEMENT = named("jobs.sql", "movement")
 OUTLOOK = named("jobs.sql", "outlook")
 
 
@@ -49,6 +50,28 @@ class Outlook:
     expected_end: datetime | None
 
 
+@dataclass(frozen=True)
+class Movement:
+    """Whether running jobs and the queue go on.
+
+    Attributes:
+        workers: that are alive.
+        running: number of running jobs.
+        silent_job, silent_s: the running job that has reported nothing for the longest time.
+        claimable: number of waiting jobs that a worker may claim.
+        first_job: of these, the one that has waited for the longest time.
+        still_s: for how long that job waits while no job was claimed and none ended; 0 without.
+    """
+
+    workers: int
+    running: int
+    silent_job: UUID | None
+    silent_s: float
+    claimable: int
+    first_job: UUID | None
+    still_s: float
+
+
 MESSAGE_COLUMNS = columns_of(JobMessage, job_message, at=job_message.c.written_at)
 
 
@@ -72,3 +95,13 @@ def outlook(connection: Connection, job_id: UUID) -> Outlook:
 def count_workers(connection: Connection) -> int:
     """The number of workers that are alive."""
     return int(connection.scalar(COUNT_WORKERS, {"beating_s": BEATING_S}) or 0)
+
+
+def movement(connection: Connection, running_limit: int | None) -> Movement:
+    """Whether running jobs and the queue go on.
+
+    Args:
+        running_limit: most running jobs of one owner; None: no limit.
+    """
+    values = {"running_limit": running_limit, "beating_s": BEATING_S}
+    return only(Movement, connection.execute(MOVEMENT, values))

@@ -102,3 +102,36 @@ from own, queued, under_way, workers
 -- The workers that have sent a heartbeat lately.
 select count(*) from procrastinate_workers
 where last_heartbeat > clock_timestamp() - make_interval(secs => :beating_s)
+
+-- name: movement
+-- Whether jobs move: the running job whose process has been silent for longest, and the job that has waited
+-- for longest of those that may be claimed. The queue moves when a job is claimed or ends; the last message
+-- of an ended job tells when it ended.
+with running as (
+    select id, owner, extract(epoch from clock_timestamp() - updated_at) as silent_s
+    from job where state = 'running'
+), busy as (
+    select owner, count(*) as n from running group by owner
+), claimable as (
+    select id, extract(epoch from clock_timestamp() - greatest(updated_at, not_before)) as waited_s
+    from job left join busy on busy.owner is not distinct from job.owner
+    where state = 'accepted' and (not_before is null or not_before <= clock_timestamp())
+        and coalesce(busy.n, 0) < coalesce(cast(:running_limit as bigint), coalesce(busy.n, 0) + 1)
+), last_end as (
+    select written_at from job_message join job on job.id = job_id
+    where state not in ('accepted', 'running') order by job_message.id desc limit 1
+), silent as (
+    select id, silent_s from running order by silent_s desc limit 1
+), first as (
+    select id, waited_s from claimable order by waited_s desc limit 1
+)
+select (select count(*) from procrastinate_workers
+        where last_heartbeat > clock_timestamp() - make_interval(secs => :beating_s)) as workers,
+    (select count(*) from running) as running,
+    (select id from silent) as silent_job,
+    cast(coalesce((select silent_s from silent), 0) as float) as silent_s,
+    (select count(*) from claimable) as claimable,
+    (select id from first) as first_job,
+    cast(coalesce((select least(waited_s, extract(epoch from clock_timestamp() - greatest(
+        (select max(claimed_at) from job_turn), (select written_at from last_end)))) from first), 0)
+        as float) as still_s
