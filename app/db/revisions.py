@@ -16,6 +16,9 @@ from app.db.preparation import prepare
 from app.db.sql_files import sql_file
 from app.errors import InputError
 
+OWN_WARNING = "01000"
+"""SQLSTATE of a warning that a statement raises."""
+
 log = logging.getLogger(__name__)
 
 DriverConnection = psycopg.Connection[tuple[Any, ...]]
@@ -135,7 +138,8 @@ def _grant_reading(dsn: str) -> None:
 
 
 def _log_warning(notice: psycopg.errors.Diagnostic) -> None:
-    if notice.severity_nonlocalized == "WARNING":
+    """Log the warnings of the statement itself: those of PostgreSQL name the tables of PostGIS."""
+    if notice.severity_nonlocalized == "WARNING" and notice.sqlstate == OWN_WARNING:
         log.warning("%s", notice.message_primary)
 
 

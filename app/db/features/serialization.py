@@ -67,7 +67,8 @@ def csv_text(layout: Layout) -> ColumnElement[str]:
 
 
 def _json(item: Property) -> ColumnElement[Any]:
-    value = plain_value(item)
+    # A date of to_json is that of RFC 3339, in half the time of to_char.
+    value = item.expression if item.type == "date" else plain_value(item)
     if not item.is_number and item.type != "boolean":
         value = func.to_json(value)
     if item.nullable:
