@@ -21,7 +21,7 @@ SECRET_BYTES = 32
 INVALID_TOKEN = "the token is unknown, expired or revoked"
 MISSING_TOKEN = (
     "this request needs a token: send the header `Authorization: Bearer TOKEN`, "
-    "or Basic with the token as password; in a browser, sign in at /sign-in"
+    "or Basic with the token as password; in a browser, sign in on the page `sign-in`"
 )
 
 

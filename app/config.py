@@ -4,6 +4,7 @@ No other module reads the environment.
 """
 
 import os
+import re
 from ipaddress import ip_network
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,6 +14,7 @@ from pydantic_core import PydanticCustomError
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict, SettingsError
 
 from app.errors import InputError
+from app.public_url import normal_public_url
 
 GIBIBYTE = 1 << 30
 MEBIBYTE = 1 << 20
@@ -27,6 +29,10 @@ MAP_BACKGROUND = (
 
 No character is allowed that ends a source of the content security policy.
 """
+
+
+SECRET_PARTS = re.compile(r"^.*(?=@)|(?<=[?#]).*$", re.DOTALL)
+"""Of a wrong address in a message: what stands before its host, and its query."""
 
 
 def default_data_folder() -> Path:
@@ -80,6 +86,8 @@ class Settings(BaseSettings):
         map_background: address of the tiles of the background of the map, `https://host/{z}/{x}/{y}.png`,
             or a path of this site; None draws land only.
         map_background_attribution: who made them; shown on the map.
+        public_url: address that callers use, where it is not the one in their header `Host`:
+            `https://host/path/`; links, redirects and cookies follow it.
         trusted_hosts: further names in the header `Host` that the API answers to; `*` for all.
         oidc_issuer: OpenID Connect issuer whose tokens are accepted too; None accepts none.
         oidc_audience: required audience of such a token.
@@ -130,6 +138,7 @@ class Settings(BaseSettings):
     cors_origins: Annotated[tuple[str, ...], NoDecode] = ()
     map_background: str | None = Field(default=None, pattern=MAP_BACKGROUND)
     map_background_attribution: str | None = Field(default=None, max_length=200, pattern=r"\S")
+    public_url: str | None = None
     trusted_hosts: Annotated[tuple[str, ...], NoDecode] = ()
     oidc_issuer: str | None = None
     oidc_audience: str = "amers"
@@ -159,6 +168,14 @@ class Settings(BaseSettings):
     @classmethod
     def _networks(cls, proxies: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(str(ip_network(proxy)) for proxy in proxies)
+
+    @field_validator("public_url")
+    @classmethod
+    def _public(cls, url: str | None) -> str | None:
+        try:
+            return None if url is None else normal_public_url(url)
+        except ValueError as fault:
+            raise PydanticCustomError("address", "{fault}", {"fault": str(fault)}) from None
 
     @field_validator("map_background")
     @classmethod
@@ -201,8 +218,8 @@ def read_settings() -> Settings:
         return Settings()
     except ValidationError as error:
         problems = "; ".join(
-            f"AMERS_{'_'.join(str(part) for part in item['loc']).upper()}: {item['input']!r:.60} found; "
-            f"{item['msg']}"
+            f"AMERS_{'_'.join(str(part) for part in item['loc']).upper()}: "
+            f"{_shown(item['input'])} found; {item['msg']}"
             for item in error.errors()
         )
         raise InputError(f"environment: {problems}") from None
@@ -211,3 +228,10 @@ def read_settings() -> Settings:
             "environment: AMERS_OIDC_SCOPES: it cannot be read; expected a JSON object such as "
             '{"amers:read": "read"}'
         ) from None
+
+
+def _shown(value: object) -> str:
+    """The beginning of a value, without what may be a secret: a user with a password, a query."""
+    if not isinstance(value, str):
+        return f"{value!r:.60}"
+    return f"{SECRET_PARTS.sub('…', value)!r:.60}"

@@ -37,6 +37,7 @@ from app.api import (
 )
 from app.api.body import BoundedBodies
 from app.api.hosts import TrustedHosts
+from app.api.public_address import PublicAddress
 from app.api.reply_headers import ReplyHeaders
 from app.api.request_log import RequestLog, RequestMetrics
 from app.api.routes import CallerRoute
@@ -157,13 +158,15 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         expose_headers=CORS_EXPOSED,
     )
     app.add_middleware(TusRequests)
+    if settings.public_url is not None:
+        app.add_middleware(PublicAddress, url=settings.public_url)
     app.add_middleware(TrustedHosts, settings=settings)
     app.state.metrics = RequestMetrics()
     app.state.uploads = deps.upload_turns()
     app.state.turns = deps.turns_for(settings)
     app.state.issuer = None if settings.oidc_issuer is None else Issuer(settings)
     app.add_middleware(RequestLog, metrics=app.state.metrics)
-    app.add_middleware(ReplyHeaders)
+    app.add_middleware(ReplyHeaders, settings=settings)
     error_responses.install(app)
     openapi.install(app, ROUTERS, settings)
     for router in ROUTERS:

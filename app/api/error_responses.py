@@ -51,6 +51,7 @@ UNUSABLE = (None, "22003", "22021", "22P05")
 """SQLSTATEs of numbers and characters that PostgreSQL cannot store; None: the driver refused them."""
 RETRY = {"Retry-After": "5"}
 HEADERS = {429: RETRY}
+MOST_SHOWN = 200
 
 log = logging.getLogger(__name__)
 
@@ -135,7 +136,14 @@ def _malformed(request: Request, error: Exception) -> JSONResponse:
 def _not_routed(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     headers = dict(error.headers) if error.headers else None
-    return problem(error.status_code, str(error.detail), headers=headers)
+    detail = str(error.detail)
+    if detail == HTTPStatus.NOT_FOUND.phrase:
+        # No route: a proxy may pass on a path that the service does not know to be its own.
+        path, base = request.url.path[:MOST_SHOWN], request.base_url
+        detail = (
+            f"nothing is at {path!r}; the paths of this service begin with {base} (AMERS_PUBLIC_URL)"
+        )
+    return problem(error.status_code, detail, headers=headers)
 
 
 def _failed(request: Request, error: Exception) -> JSONResponse:

@@ -1,7 +1,11 @@
-"""Hosts under which the service may be addressed: links in replies are built from the header `Host`."""
+"""Hosts under which the service may be addressed.
+
+Without a public address, links in replies are built from the header `Host`.
+"""
 
 import socket
 from collections.abc import Iterable
+from urllib.parse import urlsplit
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -17,7 +21,7 @@ class TrustedHosts:
     Without this check, a page of another site whose name is bound to the address of the service could
     read from it (DNS rebinding), and links in replies could lead to another site. Accepted are the
     loopback names, the name of the machine, the address that the connection has arrived at, the host of
-    the settings and the trusted hosts of the settings.
+    the settings, that of the public address and the trusted hosts of the settings.
 
     Attributes:
         app: the application that gets the accepted requests.
@@ -26,7 +30,8 @@ class TrustedHosts:
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
         self.app = app
-        own = (*LOOPBACK, settings.host, socket.gethostname())
+        public = urlsplit(settings.public_url or "").hostname or settings.host
+        own = (*LOOPBACK, settings.host, public, socket.gethostname())
         self.names = frozenset(name.lower() for name in (*own, *settings.trusted_hosts))
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -6,9 +6,12 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.api.credentials import browser_may_have_added
 from app.api.session_cookie import ENDED_SESSION, removal
+from app.config import Settings
 
 NO_STORE = "no-store"
 FIRST_ERROR = 400
+STRICT_TRANSPORT = "max-age=31536000"
+"""A year, RFC 6797. It is about this host alone: other hosts of the domain may be of others."""
 
 
 class ReplyHeaders:
@@ -18,12 +21,16 @@ class ReplyHeaders:
     is sent to a password or a session is not embedded by other sites:
     `Cross-Origin-Resource-Policy: same-origin`. The cookie of a session that has ended is removed.
 
+    Where the public address begins with https, `Strict-Transport-Security` keeps browsers from its host
+    without TLS.
+
     Attributes:
         app: the application that gets the requests.
     """
 
-    def __init__(self, app: ASGIApp) -> None:
+    def __init__(self, app: ASGIApp, settings: Settings) -> None:
         self.app = app
+        self._only_tls = (settings.public_url or "").startswith("https:")
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle one request."""
@@ -37,6 +44,8 @@ class ReplyHeaders:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 headers["X-Content-Type-Options"] = "nosniff"
+                if self._only_tls:
+                    headers["Strict-Transport-Security"] = STRICT_TRANSPORT
                 if by_browser:
                     # A browser sends it with images that other sites embed, too.
                     headers["Cross-Origin-Resource-Policy"] = "same-origin"

@@ -55,4 +55,4 @@ def _seal(content: str, secret: bytes) -> str:
 
 
 def _ended(why: str) -> NotAllowed:
-    return NotAllowed(f"{why}: sign in again at /sign-in", authenticated=False)
+    return NotAllowed(f"{why}: sign in again on the page `sign-in`", authenticated=False)

@@ -22,6 +22,7 @@ from app.api.negotiation import (
 )
 from app.api.operations_page import operations_page
 from app.api.pages import Cell, Page, document_page
+from app.api.public_address import address_state, log_wrong_address
 from app.api.routes import CallerRoute
 from app.usecases.readiness import Readiness, overall
 
@@ -81,6 +82,7 @@ LINKS = (
 def landing(*, request: Request, f: Format = None) -> Response:
     """Return the landing page with links to everything else."""
     refuse_unknown(request, {"f"})
+    log_wrong_address(request)
     title, description = request.app.title, request.app.description
     links = [
         Link(rel=rel, href=f"{request.base_url}{path}", type=kind, title=text)
@@ -120,7 +122,8 @@ def conformance(*, request: Request, f: Format = None) -> Response:
 def description(*, request: Request, f: Format = None) -> Response:
     """Return the description of the API in OpenAPI 3.1, or a page of its operations."""
     refuse_unknown(request, {"f"})
-    document: dict[str, Any] = request.app.openapi()
+    server = {"url": str(request.base_url).rstrip("/")}
+    document: dict[str, Any] = request.app.openapi() | {"servers": [server]}
     form = chosen_format(request, {"json": OPENAPI_JSON, "plain": JSON, "html": HTML}, f)
     if form != "html":
         # GDAL refuses the media type of OpenAPI 3.1; its Accept header also allows plain JSON.
@@ -138,7 +141,7 @@ def alive() -> Health:
 def ready(*, request: Request, response: Response) -> ReadinessReport:
     """Report what of the service works; 503 when requests that read cannot be answered."""
     readiness: Readiness = request.app.state.readiness
-    parts = readiness.check()
+    parts = {**readiness.check(), "address": address_state(request)}
     status = overall(parts)
     if status == "not ready":
         response.status_code = 503

@@ -8,6 +8,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.api.error_responses import problem
+from app.api.public_address import own_path
 
 VERSION = "1.0.0"
 UPLOADS = "/uploads"
@@ -27,7 +28,7 @@ class TusRequests:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle one request."""
-        if scope["type"] != "http" or not _is_upload(scope["path"]):
+        if scope["type"] != "http" or not _is_upload(own_path(scope)):
             await self.app(scope, receive, send)
             return
 

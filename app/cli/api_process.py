@@ -9,7 +9,7 @@ import uvicorn
 
 from app import logs
 from app.api import connections
-from app.config import read_settings
+from app.config import Settings, read_settings
 
 DRAIN_SECONDS = 30
 """Time that requests under way have to finish when the service stops."""
@@ -35,6 +35,7 @@ def run(descriptors: list[int]) -> None:
     """
     settings = read_settings()
     logs.configure(settings)
+    _log_public_address(settings)
     # What is imported stays: a search for garbage in it finds none.
     gc.disable()
     application = import_module("app.main").create_app
@@ -50,3 +51,15 @@ def run(descriptors: list[int]) -> None:
         timeout_graceful_shutdown=DRAIN_SECONDS,
     )
     _Server(config).run([socket.socket(fileno=number) for number in descriptors])
+
+
+def _log_public_address(settings: Settings) -> None:
+    """Log the address of callers, and what is certainly missing for the proxy that has it."""
+    if settings.public_url is None:
+        return
+    log.info("callers use %s", settings.public_url)
+    if settings.public_url.startswith("https:") and not settings.trusted_proxies:
+        log.warning(
+            "AMERS_PUBLIC_URL has TLS, which a proxy gives, and AMERS_TRUSTED_PROXIES names none: all "
+            "callers share the connections and turns of one; name the address of the proxy there"
+        )

@@ -49,7 +49,7 @@ def part(client: TestClient) -> Callable[[str, int], dict[str, str]]:
 
 
 def test_a_service_with_a_worker_is_ready_and_without_one_it_still_answers(client, dsn):
-    parts = {"database": OK, "schema": OK, "worker": NO_WORKER, "storage": OK, "disk": OK}
+    parts = {"database": OK, "schema": OK, "worker": NO_WORKER, "storage": OK, "disk": OK, "address": OK}
     reply = client.get("/readyz")
     assert (reply.status_code, reply.json()) == (200, {"status": "degraded", "parts": parts})
     with engine.connect(dsn) as connection:
