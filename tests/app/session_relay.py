@@ -41,7 +41,7 @@ class Relay:
     """Counts the statements of all sessions since the last `arm`, and ends the session of one of them.
 
     Attributes:
-        dsn: of the same database, through the relay.
+        direct, dsn: of the database itself, and through the relay.
         count: of the statements.
         has_ended: whether the session of the chosen statement was ended.
     """
@@ -49,6 +49,7 @@ class Relay:
     def __init__(self, dsn: str, port: int) -> None:
         address = conninfo_to_dict(dsn)
         self._place = str(Path(str(address["host"])) / f".s.PGSQL.{address['port']}")
+        self.direct = dsn
         self._control = make_conninfo(dsn, user=SUPERUSER, dbname="postgres")
         self.dsn = make_conninfo(
             dsn, host="127.0.0.1", port=port, sslmode="disable", gssencmode="disable"

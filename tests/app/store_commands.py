@@ -173,7 +173,7 @@ class Installations:
 def fill(dsn: str, made: Path, *, points: int, size: int) -> None:
     """Fill an installation, and write the files that commands take, into a folder."""
     world = make_flat_world(made / "world", size=size, points=points)
-    settings = _settings(dsn, made)
+    settings = settings_of(dsn, made)
     storage = Storage(settings.data_folder / "storage")
     write(made / "land.tif", np.full((SIZE, SIZE), 300.0, np.float32))
     (made / "joint").mkdir()
@@ -197,7 +197,7 @@ def fill(dsn: str, made: Path, *, points: int, size: int) -> None:
 
 def register(dsn: str, made: Path) -> None:
     """Record a registration of the scene in a filled installation."""
-    settings, scene = _settings(dsn, made), made / "world/tagged.tif"
+    settings, scene = settings_of(dsn, made), made / "world/tagged.tif"
     with engine.pooled(dsn, settings) as database:
         storage = Storage(settings.data_folder / "storage")
         registered = run_registration(
@@ -210,5 +210,11 @@ def register(dsn: str, made: Path) -> None:
             record_registration(connection, registered, image_key(scene))
 
 
-def _settings(dsn: str, made: Path) -> Settings:
-    return Settings(database_url=SecretStr(dsn), data_folder=made / "data", reference_folder=made)
+def settings_of(dsn: str, made: Path, data: Path | None = None) -> Settings:
+    """Settings of an installation whose other files are in a folder, as its data by default."""
+    return Settings(
+        database_url=SecretStr(dsn),
+        data_folder=data or made / "data",
+        reference_folder=made,
+        ingest_folder=made,
+    )

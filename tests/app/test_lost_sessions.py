@@ -43,6 +43,22 @@ LONG_WORK = {"block renew", "scene register", "scene register-many"}
 """Commands that compute for seconds: `make test` leaves them out."""
 OF_POSTGRES = {"db backup", "db restore"}
 """Commands whose work PostgreSQL's own programs do: their failure is that of the installation."""
+READING = {
+    "audit",
+    "block export",
+    "block list",
+    "block quality",
+    "block show",
+    "db status",
+    "points query",
+    "points suspensions",
+    "reference list",
+    "store sweep",
+    "store trash empty",
+    "store usage",
+    "token list",
+}
+"""Commands that change nothing in the database of the small installation."""
 DRAWN = 12
 """Statements of one command that `make test-thorough` tries."""
 
@@ -190,6 +206,24 @@ def imported_through(module: str) -> set[str]:
                 if node.module.startswith("app.cli."):
                     waiting.append(node.module)
     return found
+
+
+@pytest.mark.parametrize("command", sorted(set(STORE_COMMANDS) - LONG_WORK))
+def test_a_command_on_a_read_only_database_reads_or_says_that_it_cannot_write(
+    installations: Installations, tmp_path: Path, command: str
+):
+    with installations.new(tmp_path, command) as place:
+        with psycopg.connect(place.dsn, autocommit=True) as connection:
+            name = sql.Identifier(connection.info.dbname)
+            connection.execute(
+                sql.SQL("alter database {} set default_transaction_read_only = on").format(name)
+            )
+        done = run(place, command)
+    check_ending(command, done)
+    if command in READING:
+        assert done.returncode == SUCCESS, done.stderr
+    else:
+        assert "read-only" in done.stderr
 
 
 @pytest.mark.parametrize("command", sorted(set(STORE_COMMANDS) - LONG_WORK))
