@@ -19,6 +19,7 @@ from services.errors import FormatError
 from services.formats.addresses import Address, FilePlace, file_bytes
 from services.formats.images.bands import BandMix, PixelCodes, default_mix, one_band
 from services.formats.images.datasets import GDAL_CACHE, GDAL_OPTIONS, as_format_error, open_dataset
+from services.formats.images.working_copy import Pixels, open_pixels
 from services.imagery.source import Window
 from services.map_grid import MapGrid
 from services.sensors.rpc import RpcModel
@@ -41,13 +42,15 @@ class RasterImage:
 
     Attributes:
         path: of the file, or its address.
-        dataset: the dataset that `open_raster` opened.
+        dataset: the dataset that `open_raster` opened; it tells about the image.
+        pixels: what its pixels are read from.
         mix: the bands and their weights.
         codes: what the product says about its pixels, beside what the file says.
     """
 
     path: FilePlace
     dataset: rasterio.DatasetReader
+    pixels: Pixels
     mix: BandMix
     codes: PixelCodes = field(default_factory=PixelCodes)
 
@@ -83,7 +86,7 @@ class RasterImage:
 
     def close(self) -> None:
         """Close the file; it cannot be read afterwards."""
-        self.dataset.close()
+        self.pixels.close()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """In another process the file is opened again."""
@@ -104,7 +107,8 @@ class RasterImage:
         flags = self.dataset.mask_flag_enums[band - 1]
         nodata = self.dataset.nodatavals[band - 1]
         with as_format_error(self.path, "readable pixels"), rasterio.Env(**GDAL_CACHE):
-            pixels = self.dataset.read(band, window=window)
+            dataset = self.pixels.dataset
+            pixels = dataset.read(band, window=window)
             out[:] = pixels
             for saturated in self.saturated_values(band):
                 if pixels.max() >= saturated:
@@ -112,7 +116,7 @@ class RasterImage:
             if MaskFlags.nodata in flags:
                 out[pixels == nodata] = np.nan
             elif MaskFlags.all_valid not in flags:
-                out[self.dataset.read_masks(band, window=window) == 0] = np.nan
+                out[dataset.read_masks(band, window=window) == 0] = np.nan
             elif self.codes.nodata is not None:
                 out[pixels == self.codes.nodata] = np.nan
 
@@ -139,7 +143,8 @@ def open_raster(path: FilePlace, bands: int | BandMix | None = 1) -> RasterImage
 
     Only the file itself is opened: no sidecar, no path that is a URL, no archive, no file that refers to
     others. A file at an `Address`, as operators and their catalogues give, is read by parts. The last
-    pixel is read, so that a truncated file is refused here and not during the processing.
+    pixel is read, so that a truncated file is refused here and not during the processing. A file that
+    would be unpacked again for each window is unpacked once, into a working copy.
 
     Args:
         path: of a regular file, or an address.
@@ -152,10 +157,12 @@ def open_raster(path: FilePlace, bands: int | BandMix | None = 1) -> RasterImage
         dataset = open_dataset(path)
         if bands is None:
             bands = default_mix(tuple(colour.name for colour in dataset.colorinterp))
-        image = RasterImage(path, dataset, bands if isinstance(bands, BandMix) else one_band(bands))
+        mix = bands if isinstance(bands, BandMix) else one_band(bands)
         try:
-            _check_declaration(image)
-            image.read(Window(image.shape[0] - 1, image.shape[1] - 1, 1, 1))
+            _check_declaration(path, dataset, mix)
+            image = RasterImage(path, dataset, open_pixels(path, dataset), mix)
+            last = replace(image, pixels=Pixels(path, dataset, is_copied=False))
+            last.read(Window(image.shape[0] - 1, image.shape[1] - 1, 1, 1))
         except FormatError:
             dataset.close()
             raise
@@ -279,10 +286,9 @@ def gdal_rpc(model: RpcModel) -> rasterio.rpc.RPC:
     )
 
 
-def _check_declaration(image: RasterImage) -> None:
+def _check_declaration(path: FilePlace, dataset: rasterio.DatasetReader, mix: BandMix) -> None:
     """Refuse impossible sizes and bands before memory is allocated for them."""
-    dataset, path = image.dataset, image.path
-    for band in image.mix.bands:
+    for band in mix.bands:
         if not 1 <= band <= dataset.count:
             raise FormatError(f"{path}: band {band} requested, the image has {dataset.count} bands")
         dtype = np.dtype(dataset.dtypes[band - 1])
