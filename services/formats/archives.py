@@ -30,6 +30,10 @@ LARGEST_INDEX_BYTES = 16 << 20
 """Largest index of a zip, which is read as a whole, and largest header of a tar."""
 LONGEST_TAR_END = 16 << 20
 """Zeros that may fill the last record of a tar: tools write 10 kB, old tapes have more."""
+MOST_EXPANSION = 100
+"""Unpacked bytes for each byte of an archive: images and text reach 10, zeros a thousand."""
+ALWAYS_UNPACKED_BYTES = 256 << 20
+"""What an archive may unpack to however small it is: half a second of work."""
 DAMAGE_ERRORS = (
     zipfile.BadZipFile,
     tarfile.TarError,
@@ -82,6 +86,7 @@ def check_archive(path: Path, limits: ArchiveLimits) -> tuple[Member, ...]:
         FormatError: the file is not an archive or is damaged; it exceeds the limits; or it has a member
             with an absolute path, `..`, a link, a device, encryption, or a name that occurs twice.
     """
+    expanded = max(MOST_EXPANSION * path.stat().st_size, ALWAYS_UNPACKED_BYTES)
     with _open_archive(path) as archive:
         members = []
         total = 0
@@ -94,6 +99,12 @@ def check_archive(path: Path, limits: ArchiveLimits) -> tuple[Member, ...]:
             if total > limits.total_bytes:
                 raise FormatError(
                     f"{path.name}: unpacks to more than {limits.total_bytes} bytes, which is the limit"
+                )
+            if total > expanded:
+                raise FormatError(
+                    f"{path.name}: declares {total} bytes or more in {path.stat().st_size} bytes; at "
+                    f"most {MOST_EXPANSION} bytes for each byte of the archive, or "
+                    f"{ALWAYS_UNPACKED_BYTES} bytes in all, are accepted"
                 )
             members.append(member)
     names = [str(member.path).lower() for member in members]

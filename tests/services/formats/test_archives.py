@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from services.errors import FormatError
+from services.formats import archives
 from services.formats.archives import (
     HEAD_BYTES,
     ArchiveLimits,
@@ -125,6 +126,20 @@ def test_a_bomb_is_refused_by_what_it_declares(
     assert path.stat().st_size < 10_000
     with pytest.raises(FormatError, match="more than 1000000 bytes"):
         check_archive(path, LIMITS)
+
+
+@pytest.mark.parametrize("make", [zipped, lambda files: tarred(files, mode="w:gz")])
+def test_an_archive_of_zeros_is_refused_before_it_is_unpacked(
+    tmp_path: Path, make: Callable[[dict[str, bytes]], bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A gzip of 32 MB unpacks to 32 GiB, within the limit of an upload: a minute of work."""
+    monkeypatch.setattr(archives, "ALWAYS_UNPACKED_BYTES", 100_000)
+    path = written(tmp_path, make({"scene/IMG.TIF": bytes(900_000)}))
+    with pytest.raises(
+        FormatError, match=r"declares 900000 bytes or more in .* at most 100 bytes for each"
+    ):
+        check_archive(path, LIMITS)
+    assert check_archive(written(tmp_path, make({"scene/IMG.TIF": bytes(90_000)})), LIMITS)
 
 
 def test_a_zip_that_unpacks_to_more_than_it_declares_is_refused(tmp_path: Path):
