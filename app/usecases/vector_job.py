@@ -194,6 +194,8 @@ def _correct(work: Work) -> Commit:
             "vertices": corrected.vertices,
             "added_vertices": corrected.added_vertices,
             "left_out": list(corrected.left_out),
+            "unusable": {str(number): why for number, why in corrected.unusable.items()},
+            "renamed": corrected.renamed,
             **accuracy_document(statement),
             "files": stored,
         }
@@ -225,6 +227,8 @@ def _project(work: Work) -> Commit:
             "hidden_vertices": projected.hidden_vertices,
             "outside": projected.outside,
             "left_out": list(projected.left_out),
+            "unusable": {str(number): why for number, why in projected.unusable.items()},
+            "renamed": projected.renamed,
             "files": stored,
         }
 
@@ -245,6 +249,14 @@ _COUNTS: dict[str, dict[str, Any]] = {
         "type": "array",
         "items": {"type": "integer"},
         "title": "Numbers of the features, from 1, that meet no ground",
+    },
+    "unusable": {
+        "type": "object",
+        "title": "Reasons why features, by their numbers from 1, cannot be used and were left out",
+    },
+    "renamed": {
+        "type": "object",
+        "title": "Attributes whose names the format keeps for itself, each with its new name",
     },
 }
 

@@ -49,6 +49,8 @@ class CorrectedFile:
         features, vertices: that it has.
         added_vertices: of these, on edges that the ground bends.
         left_out: numbers of the features, from 1, with a place that meets no ground.
+        unusable: numbers of the features whose geometry cannot be used, with the reason; left out too.
+        renamed: attributes that have other names in the file, with these.
         height_sigma_m: of the terrain, as used.
         relative_to_control_points, on_the_earth: predicted accuracy of the vertices.
     """
@@ -63,6 +65,8 @@ class CorrectedFile:
     height_sigma_m: float
     relative_to_control_points: StatedAccuracy
     on_the_earth: StatedAccuracy
+    unusable: dict[int, str]
+    renamed: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,7 @@ class ProjectedFile:
         hidden_vertices: that other ground hides from the sensor.
         outside: features that the scene does not show.
         left_out: numbers of the features, from 1, with a place without a height of the ground.
+        unusable, renamed: as for `CorrectedFile`.
     """
 
     path: Path
@@ -87,6 +92,8 @@ class ProjectedFile:
     hidden_vertices: int
     outside: int
     left_out: tuple[int, ...]
+    unusable: dict[int, str]
+    renamed: dict[str, str]
 
 
 _CORRECTION = CorrectionOptions()
@@ -146,9 +153,11 @@ def correct_file(
     earth_m = corrected.accuracy.on_the_earth_ce90_m
     out = corrected.shapes
     columns = {RELATIVE_CE90: out.largest(relative_m), ON_THE_EARTH_CE90: out.largest(earth_m)}
-    kept = np.flatnonzero(~corrected.missed)
+    is_kept = ~corrected.missed
+    is_kept[list(layer.unusable)] = False
+    kept = np.flatnonzero(is_kept)
     geometries = geometries_of(out)
-    write_layer(output, layer.changed(geometries, columns, crs).take(kept))
+    renamed = write_layer(output, layer.changed(geometries, columns, crs).take(kept))
     entries = np.flatnonzero(~corrected.missed[out.geometry_of])
     used = out.index[entries]
     if vertices is not None:
@@ -172,6 +181,8 @@ def correct_file(
         height_sigma_m,
         stated.relative_to_control_points,
         stated.on_the_earth,
+        by_number(layer.unusable),
+        renamed,
     )
 
 
@@ -232,7 +243,9 @@ def project_file(
         shapes.with_vertices(xy_of_line_sample(shapes.vertices[:, :2], options.pixels))
     )
     rows = np.flatnonzero(shown)
-    write_layer(output, layer.changed(drawn, {HIDDEN: hidden_share(projected)}, None).take(rows))
+    renamed = write_layer(
+        output, layer.changed(drawn, {HIDDEN: hidden_share(projected)}, None).take(rows)
+    )
     kept = np.isin(projected.shapes.geometry_of, rows)
     entries = np.flatnonzero(kept)
     used = projected.shapes.index[entries]
@@ -249,6 +262,13 @@ def project_file(
         len(used),
         projected.added,
         int(projected.hidden[used].sum()),
-        len(layer.geometries) - len(rows) - int(missed.sum()),
+        len(layer.geometries) - len(rows) - int(missed.sum()) - len(layer.unusable),
         tuple((np.flatnonzero(missed) + 1).tolist()),
+        by_number(layer.unusable),
+        renamed,
     )
+
+
+def by_number(rows: dict[int, str]) -> dict[int, str]:
+    """What rows of a layer have, by the numbers of their features, from 1."""
+    return {row + 1: value for row, value in sorted(rows.items())}

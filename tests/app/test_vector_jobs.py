@@ -226,3 +226,26 @@ def test_a_stranger_cannot_use_a_scene_for_vectors(
     for headers, status in ((stranger, 404), (bearer("read"), 403), ({}, 401)):
         reply = client.post(f"/processes/{process}/execution", json=body, headers=headers)
         assert reply.status_code == status
+
+
+def test_what_cannot_be_used_is_left_out_by_name_and_a_taken_name_is_changed(
+    client: TestClient,
+    me: dict[str, str],
+    run: Run,
+    inputs: dict[str, object],
+    registration: str,
+    tmp_path: Path,
+) -> None:
+    lines = drawn(tmp_path / "drawn.geojson", "POINT (100.5 -50.5)", "POINT (1 -1)", "POINT (2 -2)")
+    document = json.loads(lines.read_text())
+    document["features"][0]["properties"]["geom"] = "a name of mine"
+    document["features"][1]["geometry"]["type"] = "Circle"
+    lines.write_text(json.dumps(document))
+    lay(client, me, str(inputs["scene"]), lines)
+    ended = run("correct-vectors", **inputs, registration=registration, crs=UTM)
+    answer, _ = results(client, me, ended, tmp_path, "gpkg")
+    assert (answer["features"], answer["left_out"]) == (2, [])
+    assert answer["unusable"] == {"2": "unknown type of geometry 'Circle'"}
+    assert answer["renamed"] == {"geom": "geom_1"}
+    read = read_layer(tmp_path / "vectors.gpkg").attributes
+    assert read["geom_1"].to_pylist() == ["a name of mine", None]

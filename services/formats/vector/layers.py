@@ -11,7 +11,7 @@
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -43,6 +43,11 @@ _SIGNATURES = {
 _OPTIONS = {"FlatGeobuf": {"SPATIAL_INDEX": "NO"}}
 """Options of drivers; with an index, a FlatGeobuf would have its features in another order."""
 
+INFINITE = "a coordinate is not a number or infinite"
+NO_SHAPE = "a damaged geometry or a curve; points, lines and polygons with straight edges expected"
+_TAKEN = {"fid", "ogc_fid", "geom", "geometry"}
+"""Names of columns that a GeoPackage has itself, or that GDAL takes for those."""
+
 Geometries = npt.NDArray[np.object_]
 
 
@@ -56,6 +61,7 @@ class VectorLayer:
         attributes: n rows.
         crs: code or WKT of the reference system; None when there is none, or an unknown one.
         fid: (n,) numbers of the features where the format keeps them; None otherwise.
+        unusable: rows whose geometry cannot be used and is missing, each with the reason.
     """
 
     name: str
@@ -63,15 +69,18 @@ class VectorLayer:
     attributes: pa.Table
     crs: str | None
     fid: IntArray | None = None
+    unusable: dict[int, str] = field(default_factory=dict)
 
     def changed(
         self, geometries: Geometries, columns: dict[str, npt.NDArray[Any]], crs: str | None
     ) -> "VectorLayer":
         """The layer with other geometries (n,), and more attributes (n,), of which NaN is null.
 
-        They replace attributes of the same names.
+        They replace attributes of the same names, in small or capital letters.
         """
-        table = self.attributes.drop_columns([n for n in columns if n in self.attributes.column_names])
+        new = {name.lower() for name in columns}
+        former = [name for name in self.attributes.column_names if name.lower() in new]
+        table = self.attributes.drop_columns(former)
         for name, values in columns.items():
             table = table.append_column(name, pa.array(values, from_pandas=True))
         return replace(self, geometries=geometries, attributes=table, crs=crs)
@@ -79,8 +88,13 @@ class VectorLayer:
     def take(self, rows: IntArray) -> "VectorLayer":
         """The features of the given rows, in that order."""
         fid = None if self.fid is None else self.fid[rows]
+        taken = {row: number for number, row in enumerate(rows.tolist())}
         return replace(
-            self, geometries=self.geometries[rows], attributes=self.attributes.take(rows), fid=fid
+            self,
+            geometries=self.geometries[rows],
+            attributes=self.attributes.take(rows),
+            fid=fid,
+            unusable={taken[row]: why for row, why in self.unusable.items() if row in taken},
         )
 
 
@@ -99,7 +113,7 @@ def driver_of(path: Path) -> str:
 
 
 def read_layer(path: Path, name: str | None = None) -> VectorLayer:
-    """A layer of a file.
+    """A layer of a file; geometries that cannot be used are missing, and named in `unusable`.
 
     Args:
         path: of the file; the suffix states the format.
@@ -107,16 +121,17 @@ def read_layer(path: Path, name: str | None = None) -> VectorLayer:
 
     Raises:
         InputError: the suffix is that of no format, or the layer must be named.
-        FormatError: the file is damaged, or has another format than its suffix says.
+        FormatError: the file is damaged, has another format than its suffix says, or has no feature that
+            can be used.
     """
     import pyogrio  # imported here because it takes 0.4 s and only vectors need it
 
     driver = driver_of(path)
     _check_signature(path, driver)
     with _named(path, "read"), TemporaryDirectory(prefix="amers-") as folder:
-        source, is_known = str(path), True
+        source, is_known, unusable = str(path), True, dict[int, str]()
         if driver == "GeoJSON":
-            source, is_known = plain_geojson(path, Path(folder))
+            source, is_known, unusable = plain_geojson(path, Path(folder))
         layers = {str(layer): kind for layer, kind in pyogrio.list_layers(source)}
         with_geometries = [layer for layer, kind in layers.items() if kind is not None]
         names = ", ".join(with_geometries)[:300] or "none"
@@ -125,30 +140,49 @@ def read_layer(path: Path, name: str | None = None) -> VectorLayer:
         if name is not None and name not in with_geometries:
             raise InputError(f"{path}: no layer {name[:80]!r} with geometries; it has {names}")
         meta, table = pyogrio.read_arrow(source, layer=name or with_geometries[0], return_fids=True)
-    geometry_name = meta["geometry_name"] or "wkb_geometry"
-    geometries = shapely.from_wkb(
-        table[geometry_name].to_numpy(zero_copy_only=False), on_invalid="ignore"
-    )
-    # A FlatGeobuf has no bytes where a feature has no geometry.
-    size = pc.fill_null(pc.binary_length(table[geometry_name]), 0).to_numpy()
-    unread = np.flatnonzero(shapely.is_missing(geometries) & (size > 0))
-    if len(unread):
-        raise FormatError(
-            f"{path}: feature {unread[0] + 1}: a damaged geometry or a curve found; points, lines and "
-            "polygons with straight edges expected"
-        )
-    fid_name = table.column_names[0]
+    at = _geometry_column(table, meta["geometry_name"] or "wkb_geometry")
+    geometries, unread = _geometries(table.column(at))
+    unusable |= unread
+    if unusable and len(unusable) == len(geometries):
+        row, why = min(unusable.items())
+        raise FormatError(f"{path}: no feature can be used; feature {row + 1}: {why}")
+    attributes = [number for number in range(1, table.num_columns) if number != at]
     return VectorLayer(
         name or with_geometries[0],
         geometries,
-        table.drop_columns([fid_name, geometry_name]),
+        table.select(attributes),
         meta["crs"] if is_known else None,
-        table[fid_name].to_numpy() if driver == "GPKG" else None,
+        table.column(0).to_numpy() if driver == "GPKG" else None,
+        unusable,
     )
 
 
-def write_layer(path: Path, layer: VectorLayer) -> None:
+def _geometry_column(table: pa.Table, name: str) -> int:
+    """The number of the column of geometries; an attribute may have its name."""
+    columns = [number for number, one in enumerate(table.column_names) if one == name]
+    binary = [number for number in columns if pa.types.is_binary(table.schema.field(number).type)]
+    return (binary or columns)[-1]
+
+
+def _geometries(column: pa.ChunkedArray) -> tuple[Geometries, dict[int, str]]:
+    """The geometries (n,) of a column, and the rows of those that cannot be used, which are missing."""
+    geometries = shapely.from_wkb(column.to_numpy(zero_copy_only=False), on_invalid="ignore")
+    # A FlatGeobuf has no bytes where a feature has no geometry.
+    size = pc.fill_null(pc.binary_length(column), 0).to_numpy()
+    unread = np.flatnonzero(shapely.is_missing(geometries) & (size > 0))
+    xyz, owner = shapely.get_coordinates(geometries, include_z=True, return_index=True)
+    has_z = shapely.has_z(geometries)[owner]
+    is_wrong = ~np.isfinite(xyz[:, :2]).all(axis=1) | (has_z & ~np.isfinite(xyz[:, 2]))
+    infinite = np.unique(owner[is_wrong])
+    geometries[infinite] = None
+    return geometries, {int(row): NO_SHAPE for row in unread} | {int(row): INFINITE for row in infinite}
+
+
+def write_layer(path: Path, layer: VectorLayer) -> dict[str, str]:
     """Write a file with one layer; an existing one is replaced, and stays whole when writing fails.
+
+    Returns:
+        The attributes that have other names in the file, with these.
 
     Raises:
         InputError: the suffix is that of no format, or the format cannot have these features.
@@ -157,9 +191,14 @@ def write_layer(path: Path, layer: VectorLayer) -> None:
 
     driver = driver_of(path)
     geometries, kind = _of_one_type(layer.geometries, path)
-    table = layer.attributes.append_column("geometry", pa.array(shapely.to_wkb(geometries), pa.binary()))
-    if layer.fid is not None and driver == "GPKG" and "fid" not in table.column_names:
+    names = _free_names(layer.attributes, _TAKEN if driver == "GPKG" else set())
+    table = layer.attributes.rename_columns(names)
+    if layer.fid is not None and driver == "GPKG" and "fid" not in names:
         table = table.append_column("fid", pa.array(layer.fid))
+    wkb = next(
+        name for name in map("geometry{}".format, ("", *range(len(names) + 1))) if name not in names
+    )
+    table = table.append_column(wkb, pa.array(shapely.to_wkb(geometries), pa.binary()))
     path.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=".amers-", dir=path.parent) as folder:
         with _named(path, "written"), warnings.catch_warnings():
@@ -170,13 +209,37 @@ def write_layer(path: Path, layer: VectorLayer) -> None:
                 Path(folder) / path.name,
                 layer=layer.name,
                 driver=driver,
-                geometry_name="geometry",
+                geometry_name=wkb,
                 geometry_type=kind,
                 crs=layer.crs,
                 **_OPTIONS.get(driver, {}),
             )
         for file in sorted(Path(folder).iterdir()):
             file.replace(path.parent / file.name)
+    pairs = zip(layer.attributes.column_names, names, strict=True)
+    return {former: name for former, name in pairs if former != name}
+
+
+def _free_names(attributes: pa.Table, taken: set[str]) -> list[str]:
+    """Names of attributes in a file, where capital letters do not count and some names are taken.
+
+    An attribute `fid` of different whole numbers has the numbers of the features and keeps its name.
+    """
+    names, used = list[str](), {name.lower() for name in attributes.column_names} | taken
+    for number, name in enumerate(attributes.column_names):
+        is_taken = name.lower() in {one.lower() for one in names} | taken
+        if is_taken and not (name == "fid" and _numbers_features(attributes.column(number))):
+            name = next(
+                f"{name}_{n}" for n in range(1, len(used) + 2) if f"{name}_{n}".lower() not in used
+            )
+            used.add(name.lower())
+        names.append(name)
+    return names
+
+
+def _numbers_features(column: pa.ChunkedArray) -> bool:
+    is_whole = pa.types.is_integer(column.type) and column.null_count == 0
+    return is_whole and pc.count_distinct(column).as_py() == len(column)
 
 
 def _of_one_type(geometries: Geometries, path: Path) -> tuple[Geometries, str]:

@@ -15,13 +15,19 @@ from pyproj.exceptions import CRSError
 from services.errors import FormatError
 from services.formats.text_files import load_json
 
+MOST_PARTS = 1_000_000
+"""Parts of collections that are looked at: more than a body of the largest size has."""
+SHAPES = {"Point", "MultiPoint", "LineString", "MultiLineString", "Polygon", "MultiPolygon"}
+COLLECTION = "GeometryCollection"
 
-def plain_geojson(path: Path, folder: Path) -> tuple[str, bool]:
+
+def plain_geojson(path: Path, folder: Path) -> tuple[str, bool, dict[int, str]]:
     """What GDAL opens: a copy in a folder with features, name and named reference system of a file.
 
     Returns:
-        Its name, and whether its reference system is known: where the file states one that PROJ does not
-        know, GDAL would take longitudes and latitudes.
+        Its name; whether its reference system is known: where the file states one that PROJ does not
+        know, GDAL would take longitudes and latitudes; and the rows of geometries of an unknown type,
+        which the copy leaves out.
 
     Raises:
         FormatError: the file is not GeoJSON.
@@ -35,10 +41,29 @@ def plain_geojson(path: Path, folder: Path) -> tuple[str, bool]:
     crs = _named_crs(document.get("crs"))
     if crs is not None:
         plain["crs"] = {"type": "name", "properties": {"name": crs}}
-    plain["features"] = [_feature(one, path) for one in _features(document, path)]
+    features = [_feature(one, path) for one in _features(document, path)]
+    unusable = {}
+    for row, one in enumerate(features):
+        kind = _unknown_type(one["geometry"])
+        if kind is not None:
+            one["geometry"], unusable[row] = None, f"unknown type of geometry {kind!r:.60}"
+    plain["features"] = features
     copy = folder / path.name
     copy.write_text(json.dumps(plain), encoding="utf-8")
-    return f"GeoJSON:{copy}", crs is not None or "crs" not in document
+    return f"GeoJSON:{copy}", crs is not None or "crs" not in document, unusable
+
+
+def _unknown_type(geometry: Any) -> Any | None:
+    """The first type in a geometry that GeoJSON does not know; None where it knows all."""
+    left, depth = [geometry], 0
+    while left and depth < MOST_PARTS:
+        one, depth = left.pop(), depth + 1
+        kind = one.get("type") if isinstance(one, dict) else None
+        if kind == COLLECTION and isinstance(one.get("geometries"), list):
+            left += one["geometries"]
+        elif one is not None and kind not in SHAPES:
+            return "none" if kind is None else kind
+    return None
 
 
 def _features(document: dict[str, Any], path: Path) -> list[Any]:

@@ -1,5 +1,6 @@
 """Layers of vectors keep their features, and files that are none are refused."""
 
+import json
 from contextlib import suppress
 from datetime import date, datetime
 from pathlib import Path
@@ -125,7 +126,7 @@ def test_a_failed_write_leaves_the_older_file(tmp_path: Path) -> None:
     path = tmp_path / "a.gpkg"
     write_layer(path, layer())
     before = path.read_bytes()
-    twice = pa.Table.from_arrays([pa.array([1, 2])] * 2, names=["a", "a"])
+    twice = pa.table({"a": pa.array([1, 2], pa.duration("s"))})
     with pytest.raises(FormatError, match="cannot be written"):
         write_layer(path, VectorLayer("houses", layer().geometries, twice, None))
     assert path.read_bytes() == before
@@ -181,3 +182,69 @@ def test_vertices_outside_the_image_are_refused_with_what_would_fit() -> None:
         check_inside(xy, (100, 310), "qgis", 5.0)
     with pytest.raises(InputError, match=r"1 of 2 vertices.*by 50\.0 px: give the image"):
         check_inside(xy, (100, 250), "corner", 5.0)
+
+
+@pytest.mark.parametrize("suffix", ["gpkg", "fgb"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_feature_whose_coordinates_are_no_numbers_is_left_out_by_name(
+    suffix: str, value: float, tmp_path: Path
+) -> None:
+    path = tmp_path / f"a.{suffix}"
+    shapes = shapely.linestrings([[[0, 0], [1, 1]], [[0, 0], [1, 1]], [[5, 5], [6, 6]]])
+    shapely.set_coordinates(shapes, [[0, 0], [1, 1], [0, 0], [1, value], [5, 5], [6, 6]])
+    table = pa.table({"name": ["a", "b", "c"]})
+    write_layer(path, VectorLayer("a", shapes, table, "EPSG:4326"))
+    read = read_layer(path)
+    assert read.unusable == {1: "a coordinate is not a number or infinite"}
+    assert shapely.is_missing(read.geometries).tolist() == [False, True, False]
+    assert read.take(np.array([1, 2])).unusable == {0: read.unusable[1]}
+
+
+def test_a_feature_of_an_unknown_type_is_left_out_by_name(tmp_path: Path) -> None:
+    point = {"type": "Point", "coordinates": [1, 2]}
+    circle = {"type": "Circle", "coordinates": [1, 2], "radius": 3}
+    shapes = [point, circle, {"type": "GeometryCollection", "geometries": [point, circle]}, None, point]
+    features = [
+        {"type": "Feature", "properties": {"n": n}, "geometry": one} for n, one in enumerate(shapes)
+    ]
+    path = tmp_path / "a.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    read = read_layer(path)
+    assert read.unusable == {row: "unknown type of geometry 'Circle'" for row in (1, 2)}
+    assert shapely.is_missing(read.geometries).tolist() == [False, True, True, True, False]
+    assert read.attributes["n"].to_pylist() == [0, 1, 2, 3, 4]
+
+
+def test_a_file_without_any_feature_that_can_be_used_is_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "a.geojson"
+    path.write_text('{"type": "Feature", "properties": {}, "geometry": {"type": "Circle"}}')
+    with pytest.raises(
+        FormatError, match=r"a\.geojson: no feature can be used; feature 1: unknown type"
+    ):
+        read_layer(path)
+
+
+NAMES = ["geom", "geometry", "fid", "ogc_fid", "GEOM", "Name", "name", "geom_1", "wkb_geometry"]
+
+
+@pytest.mark.parametrize("suffix", ["gpkg", "geojson", "fgb"])
+def test_attributes_of_all_names_survive(suffix: str, tmp_path: Path) -> None:
+    """Some under other names, which are told: drivers take small and capital letters for the same."""
+    path = tmp_path / f"a.{suffix}"
+    table = pa.table({name: [f"{name} 1", f"{name} 2"] for name in NAMES})
+    renamed = write_layer(path, VectorLayer("a", layer().geometries, table, "EPSG:4326"))
+    again = read_layer(path)
+    assert not shapely.is_missing(again.geometries).any()
+    read = again.attributes.to_pydict()
+    for name in NAMES:
+        assert read[renamed.get(name, name)] == [f"{name} 1", f"{name} 2"]
+    taken = {"geom", "geometry", "fid", "ogc_fid"} if suffix == "gpkg" else set()
+    assert set(renamed) == {"GEOM", "name"} | taken
+    assert len({renamed.get(name, name).lower() for name in NAMES}) == len(NAMES)
+
+
+def test_columns_that_are_added_replace_those_in_capital_letters(tmp_path: Path) -> None:
+    table = pa.table({"CE90_M": ["mine", "mine"]})
+    first = VectorLayer("a", layer().geometries, table, None)
+    changed = first.changed(first.geometries, {"ce90_m": np.array([1.0, 2.0])}, None)
+    assert changed.attributes.to_pydict() == {"ce90_m": [1.0, 2.0]}
