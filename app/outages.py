@@ -145,9 +145,9 @@ STORAGE_SILENT = Outage("storage", "the storage of files does not answer")
 
 
 def outage_of(error: BaseException) -> Outage | None:
-    """The outage that an error, or one that caused it, tells of; None for any other error.
+    """The outage that an error, or one behind it, tells of; None for any other error.
 
-    An error of Amers has its own message, whatever caused it.
+    An error of Amers has its own message, whatever is behind it.
     """
     for cause in causes(error):
         if isinstance(cause, AmersError):
@@ -180,6 +180,8 @@ def _of_database(error: BaseException) -> Outage | None:
         if not _is(error, "OperationalError") and not _is_closed(error):
             return None
         words = str(error)
+        if _is(error, "UnusableSession"):
+            return _database(words, again=False)
         fitting = (row for pattern, row in BY_WORDS if re.search(pattern, words, re.IGNORECASE))
         return next(fitting, NO_ANSWER)
     found = BY_STATE.get(state) or BY_CLASS.get(state[:2])

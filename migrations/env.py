@@ -1,14 +1,15 @@
 """Run by Alembic: all missing revisions in one transaction, one upgrade at a time."""
 
-import psycopg
 from alembic import context
 from sqlalchemy import create_engine, func, select
 from sqlalchemy.pool import NullPool
 
+from app.db import session
+
 UPGRADE_LOCK = 0x616D657273  # "amers"
 
 dsn = context.config.attributes["dsn"]
-engine = create_engine("postgresql+psycopg://", creator=lambda: psycopg.connect(dsn), poolclass=NullPool)
+engine = create_engine("postgresql+psycopg://", creator=lambda: session.connect(dsn), poolclass=NullPool)
 
 with engine.begin() as connection:
     connection.execute(select(func.pg_advisory_xact_lock(UPGRADE_LOCK)))

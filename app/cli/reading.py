@@ -5,7 +5,8 @@ from contextlib import contextmanager
 
 from app.config import read_settings
 from app.db.ready import ready_database
-from app.db.revisions import DriverConnection, driver_connection
+from app.db.revisions import driver_connection
+from app.db.session import DriverConnection
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from datetime import datetime
 
 from psycopg.rows import dict_row
 
-from app.db.revisions import DriverConnection
+from app.db.session import DriverConnection
 from app.db.sql_files import sql_file
 from app.db.states import BlockState
 from services.formats.block.frame_json import parse_frame

@@ -19,7 +19,6 @@ from typing import Any
 
 import psycopg
 import sqlalchemy
-from psycopg.conninfo import conninfo_to_dict, make_conninfo
 from sqlalchemy import (
     Engine,
     ExceptionContext,
@@ -35,8 +34,10 @@ from sqlalchemy.pool import ConnectionPoolEntry, PoolProxiedConnection
 
 from app import request_context
 from app.config import Settings
+from app.db import session
 from app.db.ready import ready_database
-from app.db.revisions import DriverConnection, driver_connection, reach
+from app.db.revisions import driver_connection, reach
+from app.db.session import DriverConnection
 
 Connection = sqlalchemy.Connection
 
@@ -48,14 +49,6 @@ POOL_RECYCLE_S = 3600
 """Older connections are replaced: server processes grow with what they have seen."""
 WARM_CONNECTIONS = 2
 """Connections of each pool that are opened at the start."""
-SILENT_LINE_S = 15
-"""A TCP connection is cut when data that was sent is not confirmed for so long."""
-NOTICING_CUTS: dict[str, Any] = {
-    "tcp_user_timeout": 1000 * SILENT_LINE_S,
-    "keepalives_idle": SILENT_LINE_S,
-    "keepalives_interval": SILENT_LINE_S // 3,
-    "keepalives_count": 3,
-}
 FIRST_SPATIAL_PLAN = """select st_asgeojson(st_transform(st_setsrid(st_makepoint(n, 0, 0), 4326), 3857))
     from generate_series(0, 0) n where n = 0"""
 """Loads PostGIS and PROJ: up to 60 ms that no caller should wait for."""
@@ -127,15 +120,14 @@ def opened(settings: Settings) -> Iterator[Database]:
 @contextmanager
 def pooled(dsn: str, settings: Settings) -> Iterator[Database]:
     """Engines on a database, whatever its schema; a connection that is cut is noticed within seconds."""
-    dsn = make_conninfo(**(NOTICING_CUTS | conninfo_to_dict(dsn)))
-    limit_ms = round(1000 * settings.read_timeout_seconds)
-    # A parallel worker is a process that loads PostGIS for one query, longer than most queries take.
-    reading = (
-        f"-c default_transaction_read_only=on -c statement_timeout={limit_ms}"
-        " -c max_parallel_workers_per_gather=0"
-    )
+    reading = {
+        "default_transaction_read_only": "on",
+        "statement_timeout": f"{round(1000 * settings.read_timeout_seconds)}",
+        # A parallel worker is a process that loads PostGIS for one query, longer than most queries take.
+        "max_parallel_workers_per_gather": "0",
+    }
     if _may_read_as_reader(dsn):
-        reading += f" -c role={READER}"
+        reading["role"] = READER
     else:
         log.warning("reading as the role of the database's owner: there is no usable %s", READER)
     pool: dict[str, Any] = {
@@ -153,8 +145,8 @@ def pooled(dsn: str, settings: Settings) -> Iterator[Database]:
         "skip_autocommit_rollback": True,
         "pool_reset_on_return": None,
     }
-    reader = _engine(make_conninfo(dsn, options=reading), **pool, **autocommit)
-    writer = _engine(dsn, **pool)
+    reader = _engine(dsn, reading, **pool, **autocommit)
+    writer = _engine(dsn, {}, **pool)
     try:
         yield Database(dsn, reader, writer)
     finally:
@@ -224,11 +216,11 @@ def _may_read_as_reader(dsn: str) -> bool:
     return row is not None
 
 
-def _engine(dsn: str, **options: Any) -> Engine:
+def _engine(dsn: str, more: dict[str, str], **options: Any) -> Engine:
     """An engine whose connections are warm, checked before use, and raise the errors of the driver."""
     engine = create_engine(
         "postgresql+psycopg://",
-        creator=lambda: psycopg.connect(dsn),
+        creator=lambda: session.connect(dsn, more),
         use_native_hstore=False,
         **options,
     )

@@ -55,9 +55,9 @@ def prepare(connection: Connection) -> str:
     role, database = state.quoted_role, state.quoted_database
     if not state.is_found:
         raise InputError(
-            f"PostGIS is in schema {state.postgis} of database {state.database}, which is not on the "
-            f"search path: let a superuser run `grant usage on schema {state.postgis} to {role}` and "
-            f"`alter database {database} set search_path = public, {state.postgis}`; {SECTION}"
+            f"PostGIS is in schema {state.postgis} of database {state.database}, which the role "
+            f"{state.role} may not use: let a superuser run `grant usage on schema {state.postgis} to "
+            f"{role}`; {SECTION}"
         )
     if not state.may_create:
         raise InputError(

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import psycopg
 
+from app.db import session
 from app.db.address import unreachable
 from app.db.preparation import prepare
+from app.db.session import DriverConnection
 from app.db.sql_files import sql_file
 from app.errors import InputError
 
@@ -20,8 +21,6 @@ OWN_WARNING = "01000"
 """SQLSTATE of a warning that a statement raises."""
 
 log = logging.getLogger(__name__)
-
-DriverConnection = psycopg.Connection[tuple[Any, ...]]
 
 
 @dataclass(frozen=True)
@@ -161,6 +160,6 @@ def reach(dsn: str) -> DriverConnection:
         InputError: the database cannot be reached.
     """
     try:
-        return psycopg.connect(dsn, connect_timeout=10)
+        return session.connect(dsn)
     except psycopg.OperationalError as error:
         raise unreachable(error, dsn) from error

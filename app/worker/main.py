@@ -14,7 +14,7 @@ import procrastinate
 import psycopg
 
 from app.config import Settings
-from app.db import engine
+from app.db import engine, session
 from app.db.engine import Database
 from app.db.jobs import queue
 from app.storage import Storage, open_storage
@@ -111,7 +111,13 @@ class _Worker:
             await asyncio.sleep(PAUSE_S)
 
     async def _work(self) -> None:
-        app = procrastinate.App(connector=procrastinate.PsycopgConnector(conninfo=self.database.dsn))
+        dsn = self.database.dsn
+
+        async def begin(connection: psycopg.AsyncConnection) -> None:
+            await asyncio.to_thread(session.begin, connection.pgconn, dsn)
+
+        connector = procrastinate.PsycopgConnector(conninfo=session.patient(dsn), configure=begin)
+        app = procrastinate.App(connector=connector)
         attempts = Attempts(self.database, self.processes, self.settings, self.name, self.stop.is_set)
 
         @app.task(name=queue.TASK, queue=queue.QUEUE)

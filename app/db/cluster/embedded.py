@@ -26,6 +26,7 @@ from psycopg.conninfo import make_conninfo
 from psycopg.pq import PGconn, Ping
 
 from app.config import Settings
+from app.db import session
 from app.db.address import check_address
 from app.db.cluster.binaries import ServerUser, find_binaries, run_as, server_user
 from app.db.sql_files import sql_file
@@ -162,9 +163,9 @@ class Cluster:
         Raises:
             InputError: somebody else uses tables whose owner changes.
         """
-        options = f"-c lock_timeout={LOCK_SECONDS:g}s"
+        patience = {"lock_timeout": f"{LOCK_SECONDS:g}s"}
         try:
-            with psycopg.connect(self.dsn(name, SUPERUSER), options=options) as connection:
+            with session.connect(self.dsn(name, SUPERUSER), patience) as connection:
                 connection.execute(sql_file("ownership.sql").encode())
         except psycopg.errors.LockNotAvailable as error:
             raise InputError(
@@ -237,7 +238,8 @@ class Cluster:
 
     def _make_database(self, user: ServerUser) -> None:
         """Create the database, or take over that of a former Amers, which a superuser owns."""
-        with psycopg.connect(self.dsn("postgres", SUPERUSER), autocommit=True) as connection:
+        with session.connect(self.dsn("postgres", SUPERUSER)) as connection:
+            connection.autocommit = True
             owner = connection.execute(
                 "select pg_get_userbyid(datdba) from pg_database where datname = %s", [DATABASE]
             ).fetchone()
@@ -246,7 +248,7 @@ class Cluster:
             if owner != (ROLE,):
                 self.hand_over(DATABASE)
             try:
-                psycopg.connect(self.dsn(DATABASE)).close()
+                session.connect(self.dsn(DATABASE)).close()
             except psycopg.OperationalError:
                 # A former Amers has started the server, which admits the superuser only.
                 self._configure(user)

@@ -9,8 +9,8 @@ from pathlib import Path
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 
 from app.db.cluster.binaries import USUAL_FOLDERS
-from app.db.engine import NOTICING_CUTS
 from app.db.revisions import driver_connection
+from app.db.session import PATIENCE
 from app.errors import InputError
 
 ADVICE = {
@@ -29,7 +29,7 @@ def run_program(dsn: str, name: str, *arguments: str) -> str:
     Raises:
         InputError: there is no such program for this server, or it refuses; the message is its first.
     """
-    address = {key: str(value) for key, value in (NOTICING_CUTS | conninfo_to_dict(dsn)).items()}
+    address = {key: str(value) for key, value in (PATIENCE | conninfo_to_dict(dsn)).items()}
     if "sslpassword" in address:
         raise InputError(
             f"AMERS_DATABASE_URL has an sslpassword, which {name} would show to all users of the "

@@ -2,7 +2,7 @@
 
 from app.db import block_list
 from app.db.block_list import BlockSummary
-from app.db.revisions import DriverConnection
+from app.db.session import DriverConnection
 from services.quality.accuracy_statement import AccuracyStatement, median_accuracy
 
 
