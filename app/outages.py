@@ -63,8 +63,8 @@ MISSING = _database(
     quotes=True,
 )
 POOLER = _database(
-    "a pooler between Amers and the database hands sessions from one to another: set pool_mode=session "
-    "there, or connect directly",
+    "the pooler in front of the database gives one session to several connections in turn: set "
+    "pool_mode=session for this database there, or let AMERS_DATABASE_URL name the server itself",
     again=False,
 )
 DAMAGED = _database("the database has damaged data; its log has the details", again=False)
@@ -111,8 +111,12 @@ BY_CLASS: dict[str, Outage] = {
 """By the first two characters of a SQLSTATE that has no row of its own."""
 BY_WORDS: tuple[tuple[str, Outage], ...] = (
     ("no connection was free", _database("all connections of this process to the database are in use")),
-    ("password authentication failed|no password supplied|pg_hba|peer authentication", BY_CLASS["28"]),
-    ("role .* does not exist|user .* does not exist|no such user", BY_CLASS["28"]),
+    ("transaction blocks not allowed", POOLER),
+    ("no password supplied", _database("no password is given, and one is needed", again=False)),
+    ("authentication failed", _database("password authentication failed", again=False)),
+    ("pg_hba", _database("pg_hba.conf of the server does not let this role in from here", again=False)),
+    ("(role|user) .* does not exist|no such user", _database("there is no such role", again=False)),
+    ("permission denied for database", _database("the role may not connect to it", again=False)),
     ("database .* does not exist|no such database", _database("there is no such database", again=False)),
     ("too many (clients|connections)|connection slots|no more connections", BY_STATE["53300"]),
     ("is starting up|is shutting down|recovery mode|not yet accepting", BY_STATE["57P03"]),
@@ -127,7 +131,7 @@ BY_WORDS: tuple[tuple[str, Outage], ...] = (
         "could not translate host name|Name or service|name resolution",
         _database("its host is not known"),
     ),
-    ("Connection refused|No such file or directory", _database("nothing listens at its address")),
+    ("Connection refused|No such file or directory", _database("refused: nothing listens there")),
     ("timeout expired|timed out|query_wait_timeout", _database("the database did not answer in time")),
     ("certificate|SSL|TLS", _database("no encrypted connection can be agreed on", again=False)),
 )

@@ -1,25 +1,42 @@
 """The address of a database of your own: checked before use, in errors without its password."""
 
+import re
+
 import psycopg
 from psycopg.conninfo import conninfo_to_dict
 
 from app.errors import InputError
+from app.outages import connection_failure
 
 VARIABLE = "AMERS_DATABASE_URL"
 EXPECTED = "postgresql://USER:PASSWORD@HOST:PORT/NAME"
 SCHEMES = ("postgresql", "postgres")
 
 
-def check_address(url: str) -> None:
-    """Check that the driver can read the address of a database; it may also be `host=… dbname=…`.
+URL = re.compile(
+    r"postgres(?:ql)?://(?:(?P<user>[^:@/?#\s]*)(?::[^@/]*)?@)?(?P<hosts>[^@/?#]*)"
+    r"(?:/(?P<name>[^@/?#]*))?(?:\?[^@#]*)?"
+)
+"""An address that can be read in one way only: no part of a password can be taken for something else."""
+HOST = re.compile(r"(?:(?:[\w.%-]*|\[[0-9a-fA-F:.%\w]*\])(?::(?P<port>\d{1,5})?)?,?)*")
+PAIR = re.compile(r"(?:^|\s)(\w+)\s*=")
+UNREADABLE = (
+    f"{VARIABLE}: it cannot be read as the address of a database: give {EXPECTED}, with "
+    "characters such as @ / : % in the password written as %40 %2F %3A %25"
+)
 
-    The message of the driver is not shown: it may quote a part of the password.
+
+def check_address(url: str) -> None:
+    """Check that an address of a database can be read, and in one way only; or `host=… dbname=…`.
+
+    A password with a character that separates parts would become a host, a port or a name in part, and
+    these are shown in messages. The message of the driver is not shown, which may quote the password.
 
     Raises:
         InputError: it cannot be read.
     """
     scheme, separator, _ = url.partition("://")
-    if separator and scheme not in SCHEMES:
+    if separator and scheme not in SCHEMES and "=" not in scheme:
         raise InputError(
             f"{VARIABLE}: {scheme[:40]!r} found in front of ://, {' or '.join(SCHEMES)} expected: give "
             f"{EXPECTED}"
@@ -27,20 +44,28 @@ def check_address(url: str) -> None:
     try:
         conninfo_to_dict(url)
     except psycopg.Error:
-        raise InputError(
-            f"{VARIABLE}: it cannot be read as the address of a database: give {EXPECTED}, with "
-            "characters such as @ / : % in the password written as %40 %2F %3A %25"
-        ) from None
+        raise InputError(UNREADABLE) from None
+    if not (_is_clear_url(url) if scheme in SCHEMES and separator else _are_clear_pairs(url)):
+        raise InputError(UNREADABLE)
 
 
 def unreachable(error: psycopg.OperationalError, dsn: str) -> InputError:
-    """The error for the user when no connection can be made."""
+    """The error for the user when no connection can be made: nothing of it is the driver's text."""
     parts = conninfo_to_dict(dsn)
-    reason = " ".join(str(error).split())
-    if password := str(parts.get("password") or ""):
-        reason = reason.replace(password, "***")
     place = f"database {parts.get('dbname') or '(unnamed)'} on {parts.get('host') or 'this machine'}"
     return InputError(
-        f"the {place} cannot be reached as user {parts.get('user') or '(unnamed)'} ({reason}): check "
-        f"{VARIABLE}, and that the server runs and lets this user in"
+        f"the {place} cannot be reached as user {parts.get('user') or '(unnamed)'} "
+        f"({connection_failure(error)}): check {VARIABLE}, and that the server runs and lets this user "
+        "in"
     )
+
+
+def _is_clear_url(url: str) -> bool:
+    read = URL.fullmatch(url)
+    return read is not None and HOST.fullmatch(read["hosts"]) is not None
+
+
+def _are_clear_pairs(text: str) -> bool:
+    """Whether each name of `name=value …` is there once: a password can hold a blank and a name."""
+    names = PAIR.findall(text)
+    return len(names) == len(set(names))

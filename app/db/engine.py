@@ -75,6 +75,12 @@ class Database:
     reader: Engine
     writer: Engine
 
+    @property
+    def writers_are_busy(self) -> bool:
+        """Whether all connections that write are in use: one more would have to be waited for."""
+        pool = self.writer.pool
+        return isinstance(pool, QueuePool) and pool.checkedout() >= pool.size()
+
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """A connection that can only read; every statement has the time limit of the settings.
@@ -186,15 +192,6 @@ def set_origin(connection: Connection) -> None:
     )
 
 
-def check_postgis(connection: Connection) -> None:
-    """Let the database answer, and PostGIS in it.
-
-    Raises:
-        psycopg.Error: one of them does not.
-    """
-    connection.execute(select(func.postgis_version()))
-
-
 def export_snapshot(connection: Connection) -> str:
     """A name under which other connections see what this transaction sees, as long as it lasts."""
     return str(connection.scalar(select(func.pg_export_snapshot())))
@@ -290,6 +287,11 @@ def _check(
 
 
 def _raise_as_driver(context: ExceptionContext) -> None:
-    """Let callers see the driver's error: its classes say what happened, and nothing wraps it."""
+    """Let callers see the driver's error: its classes say what happened, and nothing wraps it.
+
+    A session that can write no more is replaced: after a failover another server takes the writes.
+    """
+    if isinstance(context.original_exception, psycopg.errors.ReadOnlySqlTransaction):
+        context.is_disconnect = True
     if isinstance(context.original_exception, psycopg.Error):
         raise context.original_exception

@@ -22,6 +22,8 @@ from psycopg.conninfo import conninfo_to_dict, make_conninfo
 from psycopg.pq import ExecStatus
 from psycopg.pq.abc import PGconn, PGresult
 
+from app.outages import POOLER
+
 DriverConnection = psycopg.Connection[tuple[Any, ...]]
 
 CONNECT_SECONDS = 10
@@ -119,11 +121,6 @@ TOO_FEW = (
     "the pooler in front of the database has no second connection to give: its pool_size has to be "
     "larger than the connections of all processes of Amers, see AMERS_POOL_SIZE"
 )
-SHARED = (
-    "the pooler in front of the database gives sessions to several connections in turn (pool_mode is "
-    "transaction or statement): set pool_mode=session for this database there, or let "
-    "AMERS_DATABASE_URL name the server itself"
-)
 
 
 class UnusableSession(psycopg.OperationalError):
@@ -186,10 +183,8 @@ def _require_own_session(pgconn: PGconn, dsn: str) -> None:
             theirs = _ask(other.pgconn, WHICH)
         except psycopg.errors.ConnectionTimeout as error:
             raise UnusableSession(TOO_FEW) from error
-        except psycopg.errors.ProtocolViolation as error:
-            raise UnusableSession(SHARED) from error  # pool_mode is statement: no transactions
         if theirs == mine or _ask(pgconn, WHICH) != mine:
-            raise UnusableSession(SHARED)
+            raise UnusableSession(POOLER.reason)
         _ask(other.pgconn, b"rollback")
 
 
@@ -202,7 +197,9 @@ def _statement(more: Mapping[str, str]) -> bytes:
         *(row.format(name, value) for name, value in more.items()),
     ]
     statement = sql.SQL(
-        "select pg_backend_pid(), current_setting('session_replication_role'),"
+        # No time limit of a role cuts off what comes behind.
+        "set statement_timeout = 0;"
+        " select pg_backend_pid(), current_setting('session_replication_role'),"
         " count(set_config(name, value, false))"
         " from (values {}) wanted (name, value) where current_setting(name, true) is not null"
     )

@@ -11,7 +11,7 @@ from tempfile import gettempdir
 from typing import Any
 from uuid import UUID
 
-from psycopg import OperationalError
+import psycopg
 
 from app.auth import Scope, may_access, owner_filter, require
 from app.config import Settings
@@ -25,6 +25,7 @@ from app.db.scenes import scene_names
 from app.db.schema import JobResponse
 from app.db.tokens import Token
 from app.errors import AmersError, DamagedFile, InputError, NoSuchJob, NoSuchProcess, is_no_memory
+from app.outages import outage_of
 from app.storage import Storage, open_storage
 from app.usecases import quotas
 from app.usecases.blocks.export import EXPORT_BLOCK
@@ -336,5 +337,7 @@ class _ReportedProgress:
         try:
             with self.database.transaction() as connection:
                 attempts.report(connection, self.job.id, self.job.attempt, percent, message)
-        except OperationalError as outage:
-            log.warning("job %s: the progress was not written: %s", self.job.id, outage)
+        except psycopg.Error as error:
+            if (outage := outage_of(error)) is None:
+                raise
+            log.warning("job %s: the progress was not written: %s", self.job.id, outage.reason)

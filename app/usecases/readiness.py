@@ -11,10 +11,11 @@ from typing import Literal
 import psycopg
 
 from app.config import Settings
-from app.db import engine, revisions
+from app.db import checks, engine, revisions
 from app.db.engine import Connection
 from app.db.jobs import progress
 from app.errors import NotFound, StorageOutage
+from app.outages import NO_ANSWER, outage_of
 from app.usecases import storage_identity
 from app.usecases.installation import Installation
 from app.usecases.operations import existing_folder
@@ -81,14 +82,14 @@ class Readiness:
     def _check(self) -> dict[str, Part]:
         try:
             with self._installation.database.reading() as connection:
-                engine.check_postgis(connection)
+                checks.check_reading(connection)
                 parts = {
-                    "database": OK,
+                    "database": _database(self._installation),
                     "schema": _schema(connection),
                     "worker": _worker(connection, self._installation.settings),
                 }
-        except psycopg.Error:
-            parts = {"database": Part("failed", "the database does not answer")}
+        except psycopg.Error as error:
+            parts = {"database": Part("failed", (outage_of(error) or NO_ANSWER).reason)}
         return {**parts, "storage": self._storage(), "disk": _disk(self._installation)}
 
     def _storage(self) -> Part:
@@ -105,6 +106,18 @@ def overall(parts: dict[str, Part]) -> Literal["ready", "degraded", "not ready"]
     if any(parts[name].status == "failed" for name in NEEDED_TO_READ if name in parts):
         return "not ready"
     return "ready" if all(part == OK for part in parts.values()) else "degraded"
+
+
+def _database(installation: Installation) -> Part:
+    """The database answers, but may take no writes; while all writing connections write, it does."""
+    if installation.database.writers_are_busy:
+        return OK
+    try:
+        with installation.database.transaction() as connection:
+            reason = checks.obstacle_to_writing(connection)
+    except psycopg.Error as error:
+        reason = (outage_of(error) or NO_ANSWER).reason
+    return OK if reason is None else Part("degraded", reason)
 
 
 def _schema(connection: Connection) -> Part:

@@ -10,10 +10,13 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from functools import partial
 
+import psycopg
+
 from app.db import installation, uploads
 from app.db.engine import Connection, Database
 from app.db.installation import InstallationRow
 from app.errors import Conflict, InputError, StorageOutage
+from app.outages import outage_of
 from app.storage import Marker, Storage, read_marker, write_marker
 from app.usecases import garbage_collection
 from app.usecases.uploads import arriving_files
@@ -86,8 +89,11 @@ def announce(begin: Begin, storage: Storage) -> bool:
     """Prepare the storage and log what stands against it; returns whether it belongs to the database."""
     try:
         reason = prepare(begin, storage)
-    except (StorageOutage, OSError) as outage:
-        reason = f"the storage could not be checked: {outage}"
+    except (StorageOutage, OSError, psycopg.Error) as error:
+        outage = outage_of(error)
+        if outage is None and isinstance(error, psycopg.Error):
+            raise
+        reason = f"the storage could not be checked: {outage.reason if outage else error}"
     if reason is not None:
         log.error("%s: %s", storage.place, reason)
     return reason is None

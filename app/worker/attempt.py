@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from psycopg import OperationalError
+import psycopg
 
 from app.config import Settings
 from app.db import revisions
@@ -21,6 +21,7 @@ from app.db.jobs import attempts
 from app.db.jobs.attempts import LostJob
 from app.db.jobs.jobs import Job
 from app.errors import StorageOutage, is_no_room
+from app.outages import outage_of
 from app.request_context import Origin, working_for
 from app.storage import Storage, open_storage
 from app.usecases import results
@@ -93,8 +94,12 @@ class Attempts:
             log.info("%s", lost)
         try:
             results.discard_attempt(self.database, open_storage(self.settings), job.id, job.attempt)
-        except (OperationalError, StorageOutage) as outage:
-            log.warning("job %s: the sweep has to delete the files of its attempt: %s", job.id, outage)
+        except (psycopg.Error, StorageOutage) as error:
+            if (outage := outage_of(error)) is None:
+                raise
+            log.warning(
+                "job %s: the sweep has to delete the files of its attempt: %s", job.id, outage.reason
+            )
 
     def _supervise(self, job: Job) -> None:
         """Run the process, and update the job when the process did not write an outcome."""
@@ -200,7 +205,9 @@ class Attempts:
         try:
             with self.database.transaction() as connection:
                 attempts.renew(connection, job.id, job.attempt, self.settings.lease_seconds)
-        except OperationalError as outage:
-            log.warning("job %s: the lease could not be renewed: %s", job.id, outage)
+        except psycopg.Error as error:
+            if (outage := outage_of(error)) is None:
+                raise
+            log.warning("job %s: the lease could not be renewed: %s", job.id, outage.reason)
             return False
         return True

@@ -17,6 +17,7 @@ from app.config import Settings
 from app.db import engine, session
 from app.db.engine import Database
 from app.db.jobs import queue
+from app.outages import NO_ANSWER, outage_of
 from app.storage import Storage, open_storage
 from app.usecases import storage_identity
 from app.worker.attempt import Attempts
@@ -106,8 +107,8 @@ class _Worker:
         while not self.stop.is_set():
             try:
                 await self._work()
-            except (procrastinate.exceptions.ConnectorException, psycopg.Error) as outage:
-                log.warning("the queue cannot be read: %s", outage)
+            except (procrastinate.exceptions.ConnectorException, psycopg.Error) as error:
+                log.warning("the queue cannot be read: %s", (outage_of(error) or NO_ANSWER).reason)
             await asyncio.sleep(PAUSE_S)
 
     async def _work(self) -> None:

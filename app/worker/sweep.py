@@ -9,12 +9,11 @@ import threading
 import time
 from dataclasses import dataclass
 
-import psycopg
-
 from app.config import TRASH_DAYS, Settings
 from app.db import scenes, uptime
 from app.db.engine import Database, limit_lock_wait
 from app.db.jobs import attempts, queue
+from app.outages import outage_of
 from app.storage import Storage, trash
 from app.usecases import garbage_collection, results, retention, storage_identity
 from app.usecases.blocks.uploads import remove_expired_archives
@@ -73,10 +72,11 @@ class Sweeper:
                         self.settings.job_seconds,
                         self.settings.trash_days,
                     )
-            except psycopg.OperationalError as outage:
-                log.warning("the sweep failed and is repeated: %s", outage)
-            except Exception:
-                log.exception("the sweep failed and is repeated")
+            except Exception as error:
+                if (outage := outage_of(error)) is None:
+                    log.exception("the sweep failed and is repeated")
+                else:
+                    log.warning("the sweep failed and is repeated: %s", outage.reason)
 
 
 def sweep_jobs(database: Database, lease_s: float, running_limit: int | None = None) -> None:

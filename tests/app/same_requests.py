@@ -1,4 +1,4 @@
-"""Forty requests over all routes, whose replies are the same whatever lies between Amers and its rows."""
+"""Forty requests over all routes, with the same replies whatever is between Amers and its rows."""
 
 import re
 from collections.abc import Iterator
@@ -115,9 +115,7 @@ def served_from(store: Installation, dsn: str) -> Iterator[TestClient]:
 
 def differences(found: dict[str, Reply], expected: dict[str, Reply]) -> dict[str, Any]:
     """The replies that are not equal, byte for byte."""
-    return {
-        name: (found[name], expected[name]) for name in expected if found[name] != expected[name]
-    }
+    return {name: (found[name], expected[name]) for name in expected if found[name] != expected[name]}
 
 
 def _reply(store: Installation, client: Any, role: str, path: str) -> Reply:
