@@ -10,8 +10,9 @@ from app.db.engine import Connection, Database
 from app.db.tokens import (
     Token,
     find_subject,
+    find_token_of_session,
     find_valid_token,
-    find_valid_token_by_id,
+    is_valid,
     keep_subject,
 )
 from app.errors import NotAllowed
@@ -64,13 +65,24 @@ def authenticate(connection: Connection, secret: str) -> Token:
     return token
 
 
-def authenticate_session(connection: Connection, token_id: UUID) -> Token:
+def require_still_valid(database: Database, token: Token) -> None:
+    """Refuse a caller whose token was good when the request began.
+
+    Raises:
+        NotAllowed: the token was revoked, or has expired.
+    """
+    with database.reading() as connection:
+        if not is_valid(connection, token.id):
+            raise NotAllowed(INVALID_TOKEN, authenticated=False)
+
+
+def authenticate_session(connection: Connection, token_id: UUID, session_id: UUID) -> Token:
     """The token that a session was opened with.
 
     Raises:
-        NotAllowed: the token is expired or revoked.
+        NotAllowed: the token is expired or revoked, or the session was signed out.
     """
-    token = find_valid_token_by_id(connection, token_id)
+    token = find_token_of_session(connection, token_id, session_id)
     if token is None:
         raise NotAllowed(INVALID_TOKEN, authenticated=False)
     return token

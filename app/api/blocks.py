@@ -6,7 +6,7 @@ from uuid import UUID
 from fastapi import APIRouter, Header, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from app.api.body import BINARY_BODY, announced_length, body_chunks
+from app.api.body import BINARY_BODY, announced_length
 from app.api.deps import Admin, DatabaseDep, InstallationDep, PointsReader, SettingsDep, UploadTurn
 from app.api.jobs import job_url, status_info
 from app.api.models.blocks import (
@@ -20,6 +20,7 @@ from app.api.models.blocks import (
 )
 from app.api.models.jobs import StatusInfo
 from app.api.routes import CallerRoute
+from app.api.sent_body import sent_chunks
 from app.auth import is_administrator
 from app.db.blocks import Block
 from app.db.engine import Connection
@@ -68,7 +69,7 @@ def upload_block(
     *, name: str, request: Request, installation: InstallationDep, caller: Admin
 ) -> UploadedBlock:
     """Upload a zip or tar archive of a block; send the `upload` of the reply to `POST /blocks`."""
-    sent = SentFile(name, body_chunks(request), announced_length(request))
+    sent = SentFile(name, sent_chunks(request, installation.database, caller), announced_length(request))
     return UploadedBlock(upload=uploads.receive_block(installation, caller, sent))
 
 

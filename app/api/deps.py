@@ -7,7 +7,6 @@ held a connection and waited for a thread could wait for a thread that waits for
 
 import time
 from typing import Annotated
-from uuid import UUID
 
 from fastapi import Depends, Request
 from starlette.concurrency import run_in_threadpool
@@ -16,7 +15,7 @@ from app import request_context
 from app.api.access import needs
 from app.api.body import body_of
 from app.api.credentials import BASIC, credentials_of, refuse_other_sites, session_of
-from app.api.session_cookie import ENDED_SESSION, parse_session
+from app.api.session_cookie import ENDED_SESSION, Session, parse_session
 from app.api.turns import Turns
 from app.auth import (
     Scope,
@@ -134,16 +133,16 @@ async def _session_caller(request: Request, session: str) -> Token | None:
     database: Database = request.app.state.database
     secret = await installation_secret(request, database)
     try:
-        token_id = parse_session(session, time.time(), secret)
-        return await run_in_threadpool(_session_token, database, token_id)
+        parsed = parse_session(session, time.time(), secret)
+        return await run_in_threadpool(_session_token, database, parsed)
     except NotAllowed:
         request.scope[ENDED_SESSION] = True
         return None
 
 
-def _session_token(database: Database, token_id: UUID) -> Token:
+def _session_token(database: Database, session: Session) -> Token:
     with database.reading() as connection:
-        return authenticate_session(connection, token_id)
+        return authenticate_session(connection, session.token_id, session.id)
 
 
 async def installation_secret(request: Request, database: DatabaseDep) -> bytes:

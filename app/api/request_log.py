@@ -6,6 +6,7 @@ import time
 from uuid import uuid4
 
 from prometheus_client import CollectorRegistry, Histogram
+from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.request_context import Origin, working_for
@@ -14,6 +15,8 @@ HEADER = b"x-request-id"
 ACCEPTED_ID = re.compile(rb"[A-Za-z0-9._\-]{1,64}")
 BUCKETS_S = (0.002, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 60.0)
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+LEFT = 499
+"""Status, in log and metrics only, of a request whose caller left before it got a reply."""
 NONE = "none"
 """Label of unknown paths and methods: requests for random names must not each make a time series."""
 
@@ -58,12 +61,12 @@ class RequestLog:
         sent = dict(scope["headers"]).get(HEADER, b"")
         request_id = sent if ACCEPTED_ID.fullmatch(sent) else uuid4().hex.encode()
         started = time.perf_counter()
-        status = 500
+        status, is_started = 500, False
 
         async def send_with_id(message: Message) -> None:
-            nonlocal status
+            nonlocal status, is_started
             if message["type"] == "http.response.start":
-                status = message["status"]
+                status, is_started = message["status"], True
                 headers = [*message.get("headers", ()), (HEADER, request_id)]
                 message = {**message, "headers": headers}
             await send(message)
@@ -74,6 +77,10 @@ class RequestLog:
         with working_for(origin):
             try:
                 await self.app(scope, receive, send_with_id)
+            except ClientDisconnect:
+                if is_started:
+                    raise
+                status = LEFT
             except Exception:
                 log.exception("%s %s failed", scope["method"], scope["path"])
                 raise

@@ -10,18 +10,21 @@ from uuid import UUID
 from fastapi import APIRouter, BackgroundTasks, Query, Request, Response, status
 from pydantic import BaseModel, Field
 
-from app.api.body import BINARY_BODY, announced_length, body_chunks
+from app.api.body import BINARY_BODY, announced_length
 from app.api.deps import DatabaseDep, InstallationDep, Registrar, SettingsDep, StorageDep, UploadTurn
 from app.api.files import file_reply
 from app.api.models import scenes as models
 from app.api.models.base import stated_accuracy
 from app.api.models.scenes import Scene, Scenes, StoredFile
 from app.api.routes import CallerRoute
+from app.api.sent_body import sent_chunks
 from app.db.scene_registrations import SceneRegistration
 from app.db.scenes import SceneRow
+from app.db.tokens import Token
 from app.errors import InputError
 from app.usecases import scenes
 from app.usecases.features.stac import scene_media_type
+from app.usecases.installation import Installation
 from app.usecases.scenes import SentFile
 
 router = APIRouter(tags=["scenes"], route_class=CallerRoute)
@@ -67,7 +70,7 @@ def upload_scene(
     `X-Checksum` (sha256 in hexadecimal) is compared with the file. Upload the files of its model next,
     by `PUT /scenes/{id}/files/{name}`.
     """
-    sent = _sent_file(request, name or _disposition_name(request))
+    sent = _sent_file(request, installation, caller, name or _disposition_name(request))
     row = scenes.upload_scene(installation, caller, sent, sigma_m)
     response.headers["Location"] = str(request.url_for("show_scene", scene_id=row.id))
     return _scene(row)
@@ -87,7 +90,7 @@ def upload_beside(
     caller: Registrar,
 ) -> StoredFile:
     """Upload a side file of a scene: model, terrain, mask or check points."""
-    sent = _sent_file(request, name)
+    sent = _sent_file(request, installation, caller, name)
     stored = scenes.upload_side_file(installation, caller, scene_id, sent)
     return StoredFile(
         name=stored.key.rsplit("/", 1)[1], size_bytes=stored.size_bytes, sha256=stored.sha256
@@ -192,12 +195,14 @@ def _registration(row: SceneRegistration) -> models.SceneRegistration:
     )
 
 
-def _sent_file(request: Request, name: str | None) -> SentFile:
+def _sent_file(
+    request: Request, installation: Installation, caller: Token, name: str | None
+) -> SentFile:
     if not name:
         raise InputError("the file has no name: send ?name= or the header Content-Disposition")
     return SentFile(
         name=name,
-        chunks=body_chunks(request),
+        chunks=sent_chunks(request, installation.database, caller),
         size_bytes=announced_length(request),
         sha256=_announced_sha256(request),
     )

@@ -2,13 +2,16 @@
 
 The cookie opens what the token may read, and nothing else: requests that change something need the token
 itself, which no browser adds to them. So no page of another site can forge one. The cookie holds no
-secret of the token, and ends with it: every request looks the token up.
+secret of the token, and ends with it: every request looks the token up. The service remembers the
+sessions that were signed out until their hour is over.
 
 Source: RFC 6265bis, cookies; OWASP, Cross-Site Request Forgery Prevention.
 """
 
 import hmac
-from uuid import UUID
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from uuid import UUID, uuid4
 
 from app.errors import NotAllowed
 
@@ -18,19 +21,34 @@ ENDED_SESSION = "amers.ended_session"
 """In the scope of a request whose session serves no longer: the reply removes its cookie."""
 
 
+@dataclass(frozen=True)
+class Session:
+    """A session of a browser.
+
+    Attributes:
+        id: of this session alone.
+        token_id: what it was opened with.
+        ends_at: after which it serves no longer.
+    """
+
+    id: UUID
+    token_id: UUID
+    ends_at: datetime
+
+
 def format_session(token_id: UUID, now_s: float, secret: bytes) -> str:
-    """The value of the cookie for a session that begins now.
+    """The value of the cookie for a new session that begins now.
 
     Args:
         now_s: seconds since 1970.
         secret: of the installation.
     """
-    content = f"{token_id}.{int(now_s) + LIFETIME_S}"
+    content = f"{token_id}.{uuid4()}.{int(now_s) + LIFETIME_S}"
     return f"{content}.{_seal(content, secret)}"
 
 
-def parse_session(value: str, now_s: float, secret: bytes) -> UUID:
-    """The id of the token of a session.
+def parse_session(value: str, now_s: float, secret: bytes) -> Session:
+    """The session of a cookie.
 
     Raises:
         NotAllowed: this service did not make the cookie, or the session has ended.
@@ -38,10 +56,13 @@ def parse_session(value: str, now_s: float, secret: bytes) -> UUID:
     content, _, seal = value.rpartition(".")
     if not hmac.compare_digest(seal.encode(), _seal(content, secret).encode()):
         raise _ended("the session cookie is not one of this service")
-    token_id, _, end_s = content.partition(".")
+    try:
+        token_id, session_id, end_s = content.split(".")
+    except ValueError:
+        raise _ended("the session cookie is that of an earlier version") from None
     if now_s >= int(end_s):
         raise _ended("the session has ended")
-    return UUID(token_id)
+    return Session(UUID(session_id), UUID(token_id), datetime.fromtimestamp(int(end_s), UTC))
 
 
 def removal(path: str) -> str:

@@ -1,6 +1,7 @@
 """Sign-in and sign-out of browsers, for the HTML pages."""
 
 import time
+from contextlib import suppress
 from urllib.parse import parse_qs
 
 from fastapi import APIRouter, Request, Response
@@ -11,10 +12,10 @@ from app.api.credentials import refuse_other_sites
 from app.api.deps import DatabaseDep, SecretDep
 from app.api.negotiation import refuse_unknown
 from app.api.pages import Page, document_page
-from app.api.session_cookie import COOKIE, LIFETIME_S, format_session, removal
+from app.api.session_cookie import COOKIE, LIFETIME_S, Session, format_session, parse_session, removal
 from app.auth import authenticate
 from app.db.engine import Database
-from app.db.tokens import Token
+from app.db.tokens import Token, end_session
 from app.errors import NotAllowed
 
 router = APIRouter(include_in_schema=False)
@@ -57,12 +58,20 @@ async def sign_in(request: Request, database: DatabaseDep, secret: SecretDep) ->
 
 
 @router.post("/sign-out")
-async def sign_out(request: Request) -> Response:
-    """End the session in this browser."""
+async def sign_out(request: Request, database: DatabaseDep, secret: SecretDep) -> Response:
+    """End the session, here and in this browser."""
     refuse_other_sites(request)
+    with suppress(NotAllowed):
+        session = parse_session(request.cookies.get(COOKIE, ""), time.time(), secret)
+        await run_in_threadpool(_end, database, session)
     reply = RedirectResponse(request.base_url, 303)
     reply.headers["Set-Cookie"] = removal(request.base_url.path)
     return reply
+
+
+def _end(database: Database, session: Session) -> None:
+    with database.transaction() as connection:
+        end_session(connection, session.id, session.ends_at)
 
 
 def _token(database: Database, secret: str) -> Token:

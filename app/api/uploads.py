@@ -12,7 +12,6 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from app.api.access import FURTHER_SCOPES, Public
-from app.api.body import body_chunks
 from app.api.deps import (
     DatabaseDep,
     InstallationDep,
@@ -24,6 +23,7 @@ from app.api.deps import (
 from app.api.error_responses import problem
 from app.api.models.scenes import Upload
 from app.api.routes import CallerRoute
+from app.api.sent_body import sent_chunks
 from app.api.tus import VERSION
 from app.db.uploads import UploadRow
 from app.errors import InputError
@@ -151,7 +151,7 @@ def send(
             status_code=204, headers=_headers(upload) | {"Upload-Offset": str(upload_offset)}
         )
     try:
-        piece = Piece(upload_offset, body_chunks(request), checksum)
+        piece = Piece(upload_offset, sent_chunks(request, installation.database, caller), checksum)
         arrived = uploads.append_piece(installation, upload, piece)
     except Busy as busy:
         return problem(LOCKED, str(busy), headers=TUS)

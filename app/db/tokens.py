@@ -4,12 +4,12 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from uuid import UUID, uuid4
 
-from sqlalchemy import Text, and_, bindparam, cast, func, or_, select, update
+from sqlalchemy import Text, and_, bindparam, cast, delete, exists, func, or_, select, update
 from sqlalchemy.dialects.postgresql import insert
 
 from app.db.engine import Connection, driver
 from app.db.rows import columns_of, every, first, only
-from app.db.schema import job, now, token
+from app.db.schema import ended_session, job, now, token
 from app.db.statements import HotStatement, hot
 
 
@@ -43,9 +43,12 @@ _IS_VALID = and_(
 )
 # Each request with a token begins with this one.
 VALID_TOKEN = hot(select(*COLUMNS).where(token.c.secret_hash == bindparam("secret_hash"), _IS_VALID))
-VALID_TOKEN_BY_ID = hot(
+TOKEN_OF_SESSION = hot(
     select(*COLUMNS).where(
-        token.c.id == bindparam("token_id"), token.c.secret_hash.is_not(None), _IS_VALID
+        token.c.id == bindparam("token_id"),
+        token.c.secret_hash.is_not(None),
+        _IS_VALID,
+        ~exists().where(ended_session.c.id == bindparam("session_id")),
     )
 )
 
@@ -82,9 +85,23 @@ def find_valid_token(connection: Connection, secret_hash: bytes) -> Token | None
     return _find_valid(connection, VALID_TOKEN, {"secret_hash": secret_hash})
 
 
-def find_valid_token_by_id(connection: Connection, token_id: UUID) -> Token | None:
-    """The token with a secret that has this id if it is neither expired nor revoked."""
-    return _find_valid(connection, VALID_TOKEN_BY_ID, {"token_id": token_id})
+def find_token_of_session(connection: Connection, token_id: UUID, session_id: UUID) -> Token | None:
+    """The token of a session that was not signed out, if it is neither expired nor revoked."""
+    values: dict[str, object] = {"token_id": token_id, "session_id": session_id}
+    return _find_valid(connection, TOKEN_OF_SESSION, values)
+
+
+def is_valid(connection: Connection, token_id: UUID) -> bool:
+    """Whether a token is neither expired nor revoked now."""
+    valid = select(token.c.id).where(token.c.id == token_id, _IS_VALID)
+    return connection.scalar(valid) is not None
+
+
+def end_session(connection: Connection, session_id: UUID, ends_at: datetime) -> None:
+    """Refuse a session from now on; forgets those whose time is over."""
+    connection.execute(delete(ended_session).where(ended_session.c.ends_at < now))
+    ending = insert(ended_session).values(id=session_id, ends_at=ends_at)
+    connection.execute(ending.on_conflict_do_nothing())
 
 
 def _find_valid(

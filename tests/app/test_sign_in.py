@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable
 from uuid import uuid4
 
+import anyio
 import pytest
 from fastapi.testclient import TestClient
 
@@ -94,6 +95,79 @@ def test_a_browser_signs_out(signed_in):
     assert signed_in.get(PAGE).status_code == 401
 
 
+def test_signing_out_ends_the_session_itself_and_no_other(client, token, connection):
+    """A copy of the cookie opens nothing any more; the same token in another browser does."""
+    secret = token("read")
+    cookies = []
+    for _ in range(2):
+        client.cookies.clear()
+        client.post("/sign-in", data={"token": secret})
+        cookies.append(client.cookies[COOKIE])
+    other, mine = cookies
+    client.post("/sign-out")
+    client.cookies.clear()
+
+    def status(cookie: str) -> int:
+        return client.get(MINE, headers={"Cookie": f"{COOKIE}={cookie}"}).status_code
+
+    assert (status(mine), status(other)) == (401, 200)
+    assert client.post("/sign-out", headers={"Cookie": f"{COOKIE}={mine}"}).status_code == 200
+    assert client.post("/sign-out", headers={"Cookie": f"{COOKIE}=forged"}).status_code == 200
+    assert len(run_sql(connection, "select id from ended_session").fetchall()) == 1
+
+
+def test_a_session_that_was_signed_out_is_forgotten_with_its_hour(client, token, connection):
+    for _ in range(2):
+        client.post("/sign-in", data={"token": token("read")})
+        client.post("/sign-out")
+        run_sql(connection, "update ended_session set ends_at = now() - interval '1 second'")
+        connection.commit()
+    assert len(run_sql(connection, "select id from ended_session").fetchall()) == 1
+
+
+@pytest.mark.parametrize("path", ["/sign-in", "/scenes?name=a.tif", "/collections/points/search"])
+def test_a_caller_who_leaves_in_the_middle_of_a_request_is_no_error_of_the_service(
+    settings, bearer, caplog, path
+):
+    sent = []
+
+    async def leave() -> None:
+        path_, _, query = path.partition("?")
+        headers = {"host": "localhost", "content-length": "100", **bearer("register")}
+        scope = {
+            "type": "http",
+            "asgi": {"version": "3.0", "spec_version": "2.3"},
+            "http_version": "1.1",
+            "method": "POST",
+            "scheme": "http",
+            "path": path_,
+            "raw_path": path_.encode(),
+            "root_path": "",
+            "query_string": query.encode(),
+            "headers": [(key.lower().encode(), value.encode()) for key, value in headers.items()],
+            "client": ("127.0.0.1", 50000),
+            "server": ("localhost", 8000),
+        }
+        messages = iter([{"type": "http.request", "body": b"token=", "more_body": True}])
+
+        async def receive():
+            return next(messages, {"type": "http.disconnect"})
+
+        async def send(message):
+            sent.append(message)
+
+        application = create_app(settings)
+        async with application.router.lifespan_context(application):
+            await application(scope, receive, send)
+
+    with caplog.at_level("INFO"):
+        anyio.run(leave)
+    assert [record for record in caplog.records if record.levelname in ("ERROR", "CRITICAL")] == []
+    assert [m["status"] for m in sent if m["type"] == "http.response.start" and m["status"] >= 500] == []
+    (line,) = [record for record in caplog.records if record.name == "amers.requests"]
+    assert line.status < 500
+
+
 def test_beside_a_token_in_the_header_a_session_neither_helps_nor_hinders(signed_in, bearer):
     """A script of another site may send its own token, whatever cookies the browser adds."""
     script = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "cors", "Sec-Fetch-Dest": "empty"}
@@ -134,11 +208,13 @@ def test_a_forged_session_is_refused(client, token, connection):
     client.post("/sign-in", data={"token": token("read")})
     value = client.cookies[COOKIE]
     client.cookies.clear()
-    token_id, end_s, seal = value.split(".")
+    token_id, session_id, end_s, seal = value.split(".")
     forged = (
-        f"{token_id}.{int(end_s) + 1}.{seal}",
-        f"{uuid4()}.{end_s}.{seal}",
-        f"{token_id}.{end_s}.",
+        f"{token_id}.{session_id}.{int(end_s) + 1}.{seal}",
+        f"{token_id}.{uuid4()}.{end_s}.{seal}",
+        f"{uuid4()}.{session_id}.{end_s}.{seal}",
+        f"{token_id}.{session_id}.{end_s}.",
+        f"{token_id}.{end_s}.{seal}",
         format_session(token_id, time.time(), b"another installation"),
         "x",
         "..",

@@ -7,7 +7,7 @@ Statements name columns through these tables, and the column list of a row comes
 The tables of the queue belong to procrastinate and are not described here.
 """
 
-from app.db.schema.access import audit, installation, token, uptime
+from app.db.schema.access import audit, ended_session, installation, token, uptime
 from app.db.schema.base import clock, hours, metadata, now, uptime_s
 from app.db.schema.integrity import damaged_file, result_file
 from app.db.schema.jobs import job, job_message, job_turn, scene, upload
@@ -35,6 +35,7 @@ __all__ = [
     "clock",
     "damaged_file",
     "density_cell",
+    "ended_session",
     "hours",
     "image",
     "installation",

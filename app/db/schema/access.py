@@ -44,6 +44,14 @@ token = Table(
     CheckConstraint("job_quota >= 0", name="job_quota"),
 )
 
+# Sessions of browsers that were signed out before their end; a row is needed until then.
+ended_session = Table(
+    "ended_session",
+    metadata,
+    Column("id", Uuid, primary_key=True),
+    Column("ends_at", Timestamp, nullable=False),
+)
+
 # Changes of tokens, blocks, scenes, jobs, points and reference images; triggers write it, and refuse any
 # change of it but the removal of its oldest rows, which leaves a row itself.
 audit = Table(

@@ -197,6 +197,9 @@ job_turn = Table(
     Column("owner", ForeignKey("token.id", ondelete="CASCADE")),
     Column("claimed_at", Timestamp, nullable=False),
     UniqueConstraint("owner", postgresql_nulls_not_distinct=True),
+    # CPU that jobs of the owner took, less what has been given back until `cpu_at`.
+    Column("cpu_s", Double, nullable=False, server_default=text("0")),
+    Column("cpu_at", Timestamp, nullable=False, server_default=clock),
 )
 
 # Messages of a job in their order; the trigger `job_messages` writes them.
