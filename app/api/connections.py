@@ -1,24 +1,24 @@
-"""Connections to the API: their number, and the time that heads of requests and readers of replies take.
+"""Connections to the API: the time that heads of requests and readers of replies take, and their size.
 
 Uvicorn bounds none of these. Its protocol class is extended here; the rest of the server is its own.
 """
 
 import asyncio
 import logging
-import time
-from collections import Counter
+import re
 from functools import partial
-from ipaddress import IPv6Address, ip_address, ip_network
 from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
+from app.api.open_connections import Connections
 from app.config import Settings
 
 MOST_HEAD_BYTES = 1 << 16
 """Limit of what arrives beside bodies: a head, trailers, sizes of chunks."""
-SILENT_S = 60.0
-"""Shortest time between two warnings that the service has too many connections."""
+LINGER_S = 2.0
+"""So long the rest of too large a head is thrown away; its sender would miss an abrupt reply."""
+ABSOLUTE = re.compile(rb"[A-Za-z][A-Za-z0-9+.\-]*://([^/?#]*)(.*)", re.DOTALL)
 
 log = logging.getLogger(__name__)
 
@@ -32,90 +32,6 @@ def server_options(settings: Settings) -> dict[str, Any]:
         "proxy_headers": bool(settings.trusted_proxies),
         "forwarded_allow_ips": list(settings.trusted_proxies),
     }
-
-
-def network_of(address: str) -> str:
-    """Whose address this is: an IPv4 address itself, the network /64 of an IPv6 address.
-
-    The owner of one IPv6 address has all others of its network.
-    """
-    if ":" not in address:
-        return address
-    number = int(IPv6Address(address.partition("%")[0]))
-    return str(ip_address(number >> 64 << 64))
-
-
-class Connections:
-    """The open connections of the service; without room for a newcomer, the longest idle one is closed.
-
-    Attributes:
-        most: connections in all.
-        most_per_address: connections of one address; proxies that are trusted have no such limit.
-    """
-
-    def __init__(self, settings: Settings) -> None:
-        self.most = settings.connections
-        self.most_per_address = settings.connections_per_address
-        self._proxies = [ip_network(proxy) for proxy in settings.trusted_proxies]
-        self._open: dict[BoundedProtocol, str] = {}
-        self._by_network: Counter[str] = Counter()
-        self._idle: dict[BoundedProtocol, None] = {}
-        self._warned_at = -SILENT_S
-
-    def admit(self, connection: "BoundedProtocol", address: str) -> bool:
-        """Whether there is room for a new connection, which is idle until its first request."""
-        network = network_of(address)
-        if self._by_network[network] >= self.most_per_address and not self._is_proxy(address):
-            room = self._close_idle(network)
-        else:
-            room = len(self._open) < self.most or self._close_idle(None)
-        if not room:
-            self._warn(address)
-            return False
-        self._open[connection] = network
-        self._by_network[network] += 1
-        self._idle[connection] = None
-        return True
-
-    def remove(self, connection: "BoundedProtocol") -> None:
-        """Forget a connection that ends, if it was admitted."""
-        network = self._open.pop(connection, None)
-        if network is None:
-            return
-        self._idle.pop(connection, None)
-        self._by_network[network] -= 1
-        if not self._by_network[network]:
-            del self._by_network[network]
-
-    def mark_busy(self, connection: "BoundedProtocol") -> None:
-        """Keep a connection open for newcomers: a request is in progress."""
-        self._idle.pop(connection, None)
-
-    def mark_idle(self, connection: "BoundedProtocol") -> None:
-        """Let newcomers have the place of a connection without a request."""
-        if connection in self._open:
-            self._idle[connection] = None
-
-    def _close_idle(self, network: str | None) -> bool:
-        """Close the connection that has been idle longest, of one network or of all."""
-        for connection in self._idle:
-            if network is None or self._open[connection] == network:
-                self.remove(connection)
-                connection.end()
-                return True
-        return False
-
-    def _is_proxy(self, address: str) -> bool:
-        return any(ip_address(address) in proxy for proxy in self._proxies)
-
-    def _warn(self, address: str) -> None:
-        if time.monotonic() - self._warned_at >= SILENT_S:
-            self._warned_at = time.monotonic()
-            log.warning(
-                "a connection of %s is refused: %d connections are open, none of them idle",
-                address,
-                len(self._open),
-            )
 
 
 class BoundedProtocol(HttpToolsProtocol):
@@ -133,6 +49,8 @@ class BoundedProtocol(HttpToolsProtocol):
         self._least_drained = settings.rate_seconds * settings.least_rate_bytes
         self._busy = False
         self._head_begun = False
+        self._head_bytes = 0
+        self._refused = False
         self._beside_bodies = 0
         self._head_timer: asyncio.TimerHandle | None = None
         self._reader_timer: asyncio.TimerHandle | None = None
@@ -157,27 +75,42 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Parse what arrived, if it does not grow without an end."""
-        if self.transport.is_closing():
+        if self._refused or self.transport.is_closing():
             return
         self._beside_bodies += len(data)
         super().data_received(data)
         if self._beside_bodies > MOST_HEAD_BYTES:
-            self._refuse(b"431 Request Header Fields Too Large", b"the head is larger than 64 KiB")
+            self._refuse_head()
         elif not self._busy and self._head_timer is None:
             self._await_head()
 
     def on_message_begin(self) -> None:
         """Begin a head."""
         self._head_begun = True
+        self._head_bytes = 0
         super().on_message_begin()
+
+    def on_url(self, url: bytes) -> None:
+        """Keep a part of the target of the request."""
+        self._count(len(url))
+        super().on_url(url)
 
     def on_header(self, name: bytes, value: bytes) -> None:
         """Keep a field of the head; trailers after the body are not read by anybody."""
         if self._head_begun:
+            self._count(len(name) + len(value) + len(b": \r\n"))
             super().on_header(name, value)
+
+    def send_400_response(self, msg: str) -> None:
+        """Refuse what the parser has refused, or a head that was too large for it to go on."""
+        if self._head_bytes > MOST_HEAD_BYTES:
+            self._refuse_head()
+        else:
+            super().send_400_response(msg)
 
     def on_headers_complete(self) -> None:
         """Start the request."""
+        self._take_host_of_target()
         self._head_begun = False
         self._beside_bodies = 0
         self._busy = True
@@ -255,7 +188,42 @@ class BoundedProtocol(HttpToolsProtocol):
         self._drained, self._buffered = 0, buffered
         self._reader_timer = self.loop.call_later(self._rate_s, self._check_reader)
 
-    def _refuse(self, status: bytes, detail: bytes, retry_after: bytes | None = None) -> None:
+    def _count(self, size_bytes: int) -> None:
+        """Count a part of the head, which may have arrived complete at once.
+
+        Raises:
+            ValueError: the head is too large; the parser stops.
+        """
+        self._head_bytes += size_bytes
+        if self._head_bytes > MOST_HEAD_BYTES:
+            raise ValueError("the head is too large")
+
+    def _take_host_of_target(self) -> None:
+        """Make a path of a target that is a whole address, whose host counts instead of `Host`.
+
+        OPTIONS asks by `*` about the whole service. Source: RFC 9112, sections 3.2.2 and 3.2.4.
+        """
+        if self.url == b"*" and self.parser.get_method() == b"OPTIONS":
+            self.url = b"/"
+        absolute = ABSOLUTE.fullmatch(self.url)
+        if absolute is None:
+            return
+        host, rest = absolute.groups()
+        self.url = rest if rest.startswith(b"/") else b"/" + rest
+        hosts = [place for place, (name, _) in enumerate(self.headers) if name == b"host"]
+        if len(hosts) == 1:
+            self.headers[hosts[0]] = (b"host", host)
+
+    def _refuse_head(self) -> None:
+        if self._refused:
+            return
+        self._refuse(
+            b"431 Request Header Fields Too Large", b"the head is larger than 64 KiB", linger=True
+        )
+
+    def _refuse(
+        self, status: bytes, detail: bytes, retry_after: bytes | None = None, *, linger: bool = False
+    ) -> None:
         head = [
             b"HTTP/1.1 " + status,
             b"content-type: text/plain; charset=utf-8",
@@ -263,5 +231,10 @@ class BoundedProtocol(HttpToolsProtocol):
             b"connection: close",
             *([b"retry-after: " + retry_after] if retry_after else []),
         ]
+        self._refused = True
         self.transport.write(b"\r\n".join([*head, b"", detail]))
-        self.end()
+        if linger and self.transport.can_write_eof():
+            self.transport.write_eof()
+            self._end_timer = self.loop.call_later(LINGER_S, self.transport.abort)
+        else:
+            self.end()

@@ -1,8 +1,11 @@
 """Hosts under which the service may be addressed.
 
 Without a public address, links in replies are built from the header `Host`.
+
+Source: RFC 9112, section 3.2.
 """
 
+import re
 import socket
 from collections.abc import Iterable
 from urllib.parse import urlsplit
@@ -12,6 +15,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from app.api.error_responses import problem
 from app.config import Settings
 
+HOST = re.compile(r"([A-Za-z0-9._~\-]+|\[[0-9A-Fa-f:.]+\])(:[0-9]*)?")
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
@@ -37,26 +41,32 @@ class TrustedHosts:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle one request."""
         if scope["type"] == "http":
-            arrived_at = scope["server"][0] if scope.get("server") else ""
-            for value in _hosts(scope):
-                if not self._accepts(_name_of(value), arrived_at):
-                    reply = problem(
-                        400,
-                        f"Host: {value[:100]!r} is no name of this service; "
-                        "its operator lists its public names in AMERS_TRUSTED_HOSTS",
-                    )
-                    await reply(scope, receive, send)
-                    return
+            fault = self._fault(scope)
+            if fault is not None:
+                await problem(400, f"Host: {fault}")(scope, receive, send)
+                return
         await self.app(scope, receive, send)
+
+    def _fault(self, scope: Scope) -> str | None:
+        """What is wrong with the header; None for a name of this service."""
+        hosts = [value.decode("latin-1") for name, value in scope["headers"] if name == b"host"]
+        if len(hosts) != 1:
+            # HTTP/1.0 knew no such header.
+            if not hosts and scope.get("http_version") != "1.1":
+                return None
+            return f"{len(hosts)} such headers found, one expected"
+        arrived_at = scope["server"][0] if scope.get("server") else ""
+        if HOST.fullmatch(hosts[0].strip()) and self._accepts(_name_of(hosts[0]), arrived_at):
+            return None
+        return (
+            f"{hosts[0][:100]!r} is no name of this service; "
+            "its operator lists its public names in AMERS_TRUSTED_HOSTS"
+        )
 
     def _accepts(self, name: str, arrived_at: str) -> bool:
         if name in self.names or "*" in self.names or name == arrived_at.lower():
             return True
         return any(f"*{name[dot:]}" in self.names for dot in _dots(name))
-
-
-def _hosts(scope: Scope) -> Iterable[str]:
-    return [value.decode("latin-1") for name, value in scope["headers"] if name == b"host"]
 
 
 def _name_of(host: str) -> str:

@@ -12,7 +12,7 @@ from anyio import create_task_group, wait_all_tasks_blocked
 from starlette.exceptions import HTTPException
 
 from app.api import deps, streams
-from app.api.connections import network_of
+from app.api.open_connections import network_of
 from app.api.turns import Turns
 from app.config import Settings
 from app.db import engine
