@@ -15,6 +15,7 @@ from app.api import (
     chips,
     collections,
     connect,
+    cors,
     deps,
     error_responses,
     features,
@@ -37,6 +38,7 @@ from app.api import (
 )
 from app.api.body import BoundedBodies
 from app.api.hosts import TrustedHosts
+from app.api.paths import TrailingSlashes
 from app.api.public_address import PublicAddress
 from app.api.reply_headers import ReplyHeaders
 from app.api.request_log import RequestLog, RequestMetrics
@@ -84,35 +86,6 @@ ROUTERS: tuple[APIRouter, ...] = (
     page.router,
 )
 
-CORS_METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
-CORS_HEADERS = (
-    "Authorization",
-    "Content-Type",
-    "Idempotency-Key",
-    "Prefer",
-    "Tus-Resumable",
-    "Upload-Checksum",
-    "Upload-Length",
-    "Upload-Metadata",
-    "Upload-Offset",
-    "X-Checksum",
-    "X-HTTP-Method-Override",
-    "X-Request-ID",
-)
-CORS_EXPOSED = (
-    "Amers-Scene",
-    "Content-Crs",
-    "Content-Disposition",
-    "Link",
-    "Location",
-    "Retry-After",
-    "Tus-Resumable",
-    "Upload-Expires",
-    "Upload-Length",
-    "Upload-Offset",
-    "X-Request-ID",
-)
-
 
 def create_app(settings: Settings | None = None) -> FastAPI:
     """The application of one installation; by default its settings come from the environment."""
@@ -147,16 +120,12 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         # The pages of FastAPI load scripts from other sites.
         docs_url=None,
         redoc_url=None,
+        redirect_slashes=False,
     )
     app.router.route_class = CallerRoute
     app.add_middleware(BoundedBodies, settings=settings)
-    app.add_middleware(
-        CORSMiddleware,
-        allow_origins=settings.cors_origins,
-        allow_methods=CORS_METHODS,
-        allow_headers=CORS_HEADERS,
-        expose_headers=CORS_EXPOSED,
-    )
+    app.add_middleware(TrailingSlashes)
+    app.add_middleware(CORSMiddleware, **cors.options(settings))
     app.add_middleware(TusRequests)
     if settings.public_url is not None:
         app.add_middleware(PublicAddress, url=settings.public_url)

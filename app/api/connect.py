@@ -11,8 +11,9 @@ from fastapi import APIRouter, Request, Response
 
 from app.api.negotiation import refuse_unknown
 from app.api.pages import Page, document_page
+from app.api.routes import CallerRoute
 
-router = APIRouter(include_in_schema=False)
+router = APIRouter(include_in_schema=False, route_class=CallerRoute)
 
 TITLE = "Connect"
 INTRODUCTION = (

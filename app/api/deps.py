@@ -136,7 +136,7 @@ async def _session_caller(request: Request, session: str) -> Token | None:
         parsed = parse_session(session, time.time(), secret)
         return await run_in_threadpool(_session_token, database, parsed)
     except NotAllowed:
-        request.scope[ENDED_SESSION] = True
+        setattr(request.state, ENDED_SESSION, True)
         return None
 
 

@@ -125,12 +125,23 @@ def _damaged(request: Request, error: Exception) -> JSONResponse:
 def _malformed(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
     wrong = [
-        {"field": ".".join(map(str, item["loc"])), "message": item["msg"]} for item in error.errors()
+        {"field": ".".join(map(str, item["loc"])), "message": _message(item)} for item in error.errors()
     ]
     detail = "; ".join(f"{item['field']}: {item['message']}" for item in wrong)
+    places = {item["loc"][0] for item in error.errors()}
+    if "path" in places:
+        return problem(404, f"nothing has this path: {detail}", error=NotFound.__name__, errors=wrong)
     # OGC API requires 400 for a wrong parameter of the query; a wrong body is 422.
-    only_query = all(item["loc"][0] == "query" for item in error.errors())
-    return problem(400 if only_query else 422, detail, error="InputError", errors=wrong)
+    return problem(422 if "body" in places else 400, detail, error="InputError", errors=wrong)
+
+
+def _message(item: dict[str, Any]) -> str:
+    """What is wrong with one value, and for what is no JSON, what the parser found there."""
+    if item["type"] == "json_invalid":
+        return f"{item['msg']}: {item['ctx']['error']}"
+    if item["type"] == "missing" and item["loc"] == ("body",):
+        return "the body is empty: send JSON with the header Content-Type: application/json"
+    return str(item["msg"])
 
 
 def _not_routed(request: Request, error: Exception) -> JSONResponse:
@@ -168,6 +179,8 @@ def _unusable(request: Request, error: Exception) -> JSONResponse:
     first_line = str(error).partition("\n")[0]
     log.warning("%s %s: %s", request.method, request.url.path, first_line)
     detail = f"a value of this request cannot be used: {first_line}"
+    if "\0" in request.scope["path"]:
+        return problem(404, f"nothing has this path: {detail}", error=NotFound.__name__)
     return problem(400, detail, error=InvalidParameter.__name__)
 
 

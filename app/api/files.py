@@ -1,34 +1,85 @@
-"""Files of the storage as replies."""
+"""Files of the storage as replies: whole, or the ranges that a request asks for."""
 
+import hashlib
 from collections.abc import Iterator
+from email.utils import formatdate
 
-from fastapi import Response
-from fastapi.responses import FileResponse, StreamingResponse
+from fastapi import Request, Response
+from fastapi.responses import StreamingResponse
 
-from app.storage import Storage
+from app.api.conditions import may_send_range
+from app.api.error_responses import problem
+from app.api.methods import HEAD
+from app.api.ranges import Part, content_range, multipart, wanted_ranges
+from app.errors import DamagedFile
+from app.storage import FileState, Storage
 from app.usecases.damage import named_by_row
 
 PIECE_BYTES = 1 << 20
 PAGE_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
 """A report may show its own images and styles, and nothing else."""
-HEADERS = {"X-Content-Type-Options": "nosniff", "Content-Security-Policy": PAGE_POLICY}
+HEADERS = {
+    "Accept-Ranges": "bytes",
+    "Content-Security-Policy": PAGE_POLICY,
+    "X-Content-Type-Options": "nosniff",
+}
 
 
-def file_reply(storage: Storage, key: str, media_type: str) -> Response:
-    """A file that a row names, streamed; requests for ranges work if it lies on this machine.
+def file_reply(request: Request, storage: Storage, key: str, media_type: str) -> Response:
+    """A file that a row names, or its ranges, streamed from a folder and from a bucket alike.
 
     Raises:
         DamagedFile: there is no such file.
     """
     with named_by_row(key):
-        path = storage.local(key)
-        if path is not None:
-            return FileResponse(path, media_type=media_type, headers=HEADERS)
-        length = {"Content-Length": str(storage.size(key))}
-    return StreamingResponse(_pieces(storage, key), media_type=media_type, headers=HEADERS | length)
+        state = storage.state(key)
+    size = state.size_bytes
+    if media_type.startswith("text/"):
+        media_type += "; charset=utf-8"
+    headers = {**HEADERS, **validators(key, state), "Content-Type": media_type}
+    ranges = None
+    # The standard defines ranges for GET alone.
+    if HEAD not in request.scope and may_send_range(request.headers, headers):
+        ranges = wanted_ranges(request.headers.get("range"), size)
+    if ranges is None:
+        return _reply(storage, key, 200, headers, [Part(b"", 0, size)])
+    if not ranges:
+        detail = f"Range: {request.headers['range']:.100}: the file has {size} bytes"
+        told = validators(key, state) | {"Content-Range": f"bytes */{size}"}
+        return problem(416, detail, headers=told)
+    if len(ranges) > 1:
+        headers["Content-Type"], parts = multipart(ranges, size, media_type)
+        return _reply(storage, key, 206, headers, parts)
+    headers["Content-Range"] = content_range(*ranges[0], size)
+    return _reply(storage, key, 206, headers, [Part(b"", *ranges[0])])
 
 
-def _pieces(storage: Storage, key: str) -> Iterator[bytes]:
-    with storage.open(key) as file:
-        while piece := file.read(PIECE_BYTES):
-            yield piece
+def validators(key: str, state: FileState) -> dict[str, str]:
+    """The headers that tell a client whether a file is the one it has."""
+    tag = hashlib.sha256(f"{key} {state.version}".encode()).hexdigest()[:32]
+    return {"ETag": f'"{tag}"', "Last-Modified": formatdate(state.modified_s, usegmt=True)}
+
+
+def _reply(
+    storage: Storage, key: str, status: int, headers: dict[str, str], parts: list[Part]
+) -> Response:
+    length = sum(len(part.head) + part.end - part.start for part in parts)
+    headers = headers | {"Content-Length": str(length)}
+    return StreamingResponse(_pieces(storage, key, parts), status, headers)
+
+
+def _pieces(storage: Storage, key: str, parts: list[Part]) -> Iterator[bytes]:
+    reader = storage.reader(key)
+    try:
+        for part in parts:
+            if part.head:
+                yield part.head
+            at = part.start
+            while at < part.end:
+                piece = reader.read(at, min(PIECE_BYTES, part.end - at))
+                if not piece:
+                    raise DamagedFile(key, f"ends at byte {at}, while it is read")
+                at += len(piece)
+                yield piece
+    finally:
+        reader.close()

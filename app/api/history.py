@@ -5,6 +5,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from app.api.deps import Admin, DatabaseDep
 from app.api.models.features import PointHistoryRecord
+from app.api.paths import PathNumber
 from app.api.routes import CallerRoute
 from app.usecases import history
 
@@ -21,7 +22,7 @@ class Suspension(BaseModel):
 
 @router.post("/{point_id}/suspend")
 def suspend(
-    *, point_id: int, body: Suspension, database: DatabaseDep, caller: Admin
+    *, point_id: PathNumber, body: Suspension, database: DatabaseDep, caller: Admin
 ) -> PointHistoryRecord:
     """Suspend a point: it is no longer served. The collection `point-history` has the proposals."""
     with database.transaction() as connection:
@@ -30,7 +31,7 @@ def suspend(
 
 
 @router.post("/{point_id}/reinstate")
-def reinstate(*, point_id: int, database: DatabaseDep, caller: Admin) -> PointHistoryRecord:
+def reinstate(*, point_id: PathNumber, database: DatabaseDep, caller: Admin) -> PointHistoryRecord:
     """Serve a suspended point again; its history starts anew."""
     with database.transaction() as connection:
         record = history.reinstate_point(connection, point_id)

@@ -19,6 +19,9 @@ TIFF = "image/tiff; application=geotiff"
 NPZ = "application/x-npz"
 MVT = "application/vnd.mapbox-vector-tile"
 
+NEGOTIATED = "amers.negotiated"
+"""In the scope of a request whose header Accept has decided: caches need to know that."""
+
 DOCUMENTS = {"json": JSON, "html": HTML}
 FEATURES = {
     "json": GEOJSON,
@@ -67,6 +70,7 @@ def chosen_format(request: Request, formats: Mapping[str, str], f: str | None) -
         if f not in formats:
             raise InvalidParameter(f"f: {f!r:.40} found, one of {', '.join(formats)} expected")
         return f
+    request.scope[NEGOTIATED] = True
     by_type = {kind.split(";")[0]: name for name, kind in formats.items()}
     by_type.setdefault(JSON, "json")
     accepted = []

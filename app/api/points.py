@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 
+from app.api.conditions import tag_of
 from app.api.deps import ChipsDep, DatabaseDep, PointsReader
 from app.api.features import CrsUri, Format
 from app.api.models.features import PointWithViews
@@ -20,6 +21,7 @@ from app.api.negotiation import (
     described,
     refuse_unknown,
 )
+from app.api.paths import PathNumber
 from app.api.point_page import point_page
 from app.api.routes import CallerRoute
 from app.db.features.collection import Viewer
@@ -52,13 +54,11 @@ NOT_PROPERTIES = {
     "history",
 }
 
-PointId = int
-
 
 @router.get("/{point_id}", response_class=GeoJsonResponse, responses=described(PointWithViews, HTML))
 def item(
     *,
-    point_id: PointId,
+    point_id: PathNumber,
     request: Request,
     database: DatabaseDep,
     caller: PointsReader,
@@ -87,7 +87,7 @@ def item(
 )
 def chips(
     *,
-    point_id: PointId,
+    point_id: PathNumber,
     database: DatabaseDep,
     stored: ChipsDep,
     caller: PointsReader,
@@ -100,8 +100,8 @@ def chips(
         point = points.find_point(connection, point_id)
     labelled = points.read_chips(stored, point)
     if f == "png":
-        return Response(format_sheet_png(labelled), media_type=PNG, headers=CHIPS_NEVER_CHANGE)
-    return _download(format_chips_npz(labelled), NPZ, f"{point_id}.npz")
+        return _chip_reply(format_sheet_png(labelled), PNG)
+    return _chip_reply(format_chips_npz(labelled), NPZ, f"{point_id}.npz")
 
 
 @router.get(
@@ -111,8 +111,8 @@ def chips(
 )
 def chip(
     *,
-    point_id: PointId,
-    view: int,
+    point_id: PathNumber,
+    view: PathNumber,
     database: DatabaseDep,
     stored: ChipsDep,
     caller: PointsReader,
@@ -126,16 +126,19 @@ def chip(
         point = points.find_point(connection, point_id)
     labelled = points.read_chip(stored, point, view)
     if f == "png":
-        return Response(format_chip_png(labelled.chips[0]), media_type=PNG, headers=CHIPS_NEVER_CHANGE)
+        return _chip_reply(format_chip_png(labelled.chips[0]), PNG)
     if f == "npz":
-        return _download(format_chips_npz(labelled), NPZ, f"{point_id}_{view}.npz")
+        return _chip_reply(format_chips_npz(labelled), NPZ, f"{point_id}_{view}.npz")
     tiff = format_chip_tiff(labelled.chips[0], labelled.lon_lat_h, float(labelled.gsd_m[0]))
-    return _download(tiff, TIFF, f"{point_id}_{view}.tif")
+    return _chip_reply(tiff, TIFF, f"{point_id}_{view}.tif")
 
 
-def _download(content: bytes, kind: str, name: str) -> Response:
-    disposition = {"Content-Disposition": f'attachment; filename="{name}"'}
-    return Response(content, media_type=kind, headers={**CHIPS_NEVER_CHANGE, **disposition})
+def _chip_reply(content: bytes, kind: str, name: str | None = None) -> Response:
+    """Chips as they are shown, or as a file with a name; the same chips have the same tag for ever."""
+    headers = {**CHIPS_NEVER_CHANGE, "ETag": tag_of(content)}
+    if name is not None:
+        headers["Content-Disposition"] = f'attachment; filename="{name}"'
+    return Response(content, media_type=kind, headers=headers)
 
 
 def _feature(point: PointDetail, url: str) -> dict[str, Any]:
@@ -148,6 +151,7 @@ def _feature(point: PointDetail, url: str) -> dict[str, Any]:
         | accuracy_document(points.point_accuracy(point)),
         "links": [
             {"rel": "self", "href": url, "type": GEOJSON},
+            {"rel": "alternate", "href": f"{url}?f=html", "type": HTML},
             {"rel": "collection", "href": url.rsplit("/items/", 1)[0], "type": JSON},
         ],
     }

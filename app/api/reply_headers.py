@@ -49,7 +49,7 @@ class ReplyHeaders:
                 if by_browser:
                     # A browser sends it with images that other sites embed, too.
                     headers["Cross-Origin-Resource-Policy"] = "same-origin"
-                if ENDED_SESSION in scope:
+                if ENDED_SESSION in scope.get("state", ()):
                     headers.append("Set-Cookie", removal(Request(scope).base_url.path))
                 if message["status"] >= FIRST_ERROR or "Cache-Control" not in headers:
                     headers["Cache-Control"] = NO_STORE

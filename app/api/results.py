@@ -59,7 +59,7 @@ def show_results(
     here = job_url(request, job)
     values, files = results.requested_results(storage, job)
     if job.response == "raw":
-        return _raw_reply(storage, here, values, files)
+        return _raw_reply(request, storage, here, values, files)
     members = {
         file.name: results.file_value(storage, file)
         if file.transmission == "value"
@@ -71,12 +71,18 @@ def show_results(
 
 @router.get("/jobs/{job_id}/results/{name:path}", response_class=Response)
 def download_result(
-    *, job_id: JobId, name: str, database: DatabaseDep, storage: StorageDep, caller: Reader
+    *,
+    job_id: JobId,
+    name: str,
+    request: Request,
+    database: DatabaseDep,
+    storage: StorageDep,
+    caller: Reader,
 ) -> Response:
     """Return one file of the results; of scenes registered together its name is `SCENE/NAME`."""
     with database.reading() as connection:
         job = jobs.visible_job(connection, caller, job_id)
-    return file_reply(storage, results.result_key(job, name), media_type(name))
+    return file_reply(request, storage, results.result_key(job, name), media_type(name))
 
 
 @router.get(
@@ -139,14 +145,18 @@ def _failure_reply(job: Job) -> Response:
 
 
 def _raw_reply(
-    storage: Storage, here: str, values: dict[str, Any], files: list[results.ResultFile]
+    request: Request,
+    storage: Storage,
+    here: str,
+    values: dict[str, Any],
+    files: list[results.ResultFile],
 ) -> Response:
     """Outputs as they are: one as the body, several as parts, references alone in the header Link."""
     if not values and all(file.transmission == "reference" for file in files):
         links = [f'<{here}/results/{f.name}>; rel="item"; type="{f.media_type}"' for f in files]
         return Response(status_code=HTTPStatus.NO_CONTENT, headers={"Link": ", ".join(links)})
     if not values and len(files) == 1:
-        return file_reply(storage, files[0].key, files[0].media_type)
+        return file_reply(request, storage, files[0].key, files[0].media_type)
     parts: list[Part] = [
         (name, {"Content-Type": JSON}, json.dumps(value).encode()) for name, value in values.items()
     ]

@@ -1,7 +1,10 @@
-"""The routes of the API: callers are known before the body is read, and wait for turns."""
+"""The routes of the API: callers are known before the body is read, and wait for turns.
+
+Every route replies to HEAD where it replies to GET, to OPTIONS with its methods, and to conditions.
+"""
 
 from collections.abc import Callable, Coroutine, Hashable
-from functools import partial
+from functools import partial, wraps
 from typing import Any
 
 from fastapi import Request, Response
@@ -9,15 +12,19 @@ from fastapi.dependencies.models import Dependant
 from fastapi.dependencies.utils import solve_dependencies
 from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
-from starlette.exceptions import HTTPException
+from starlette.routing import Match
+from starlette.types import Receive, Scope, Send
 
 from app.api import deps
 from app.api.body import ANONYMOUS_BODY_BYTES, body_of
-from app.api.connections import network_of
+from app.api.conditions import answer_conditions
+from app.api.json_bodies import refuse_no_json
+from app.api.methods import HEAD, allowed_methods, reply_to_other_method, without_body
+from app.api.negotiation import NEGOTIATED
+from app.api.open_connections import network_of
 from app.api.streams import Streamed
 from app.api.turns import Turns
 from app.db.tokens import Token
-from app.json_values import unusable_body
 
 Handler = Callable[[Request], Coroutine[Any, Any, Response]]
 
@@ -28,11 +35,42 @@ class CallerRoute(APIRoute):
     FastAPI reads and parses a body before the dependencies of the endpoint run. This route first
     authenticates the caller and checks the scope that the endpoint needs, then reads the body, and then
     waits for a turn of this caller. A route whose endpoint does not ask for its caller is FastAPI's own.
+
+    An endpoint of GET serves HEAD too, and sees a GET: the reply has the same headers, and its body is
+    not made where it would be made piece by piece.
     """
+
+    def matches(self, scope: Scope) -> tuple[Match, Scope]:
+        """Whether the route serves a request, or has its path alone."""
+        match, child_scope = super().matches(scope)
+        if match is Match.PARTIAL and self._heads(scope):
+            match = Match.FULL
+        return match, child_scope
+
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Reply to a request for the path of this route.
+
+        Raises:
+            HTTPException: no route of this path has the method (405).
+        """
+        if self._heads(scope):
+            # The server keeps its own scope: it must not believe that it serves a GET.
+            await super().handle({**scope, "method": "GET", HEAD: True}, receive, send)
+        elif scope["method"] in (self.methods or ()):
+            await super().handle(scope, receive, send)
+        else:
+            await reply_to_other_method(scope)(scope, receive, send)
+
+    def _heads(self, scope: Scope) -> bool:
+        """Whether a request is a HEAD that the endpoint of GET serves."""
+        methods = self.methods or ()
+        return scope["method"] == "HEAD" and "GET" in methods and "HEAD" not in methods
 
     def get_route_handler(self) -> Handler:
         """The function that replies to requests."""
-        handle = super().get_route_handler()
+        return _finishing(self._handler_for_callers(super().get_route_handler()))
+
+    def _handler_for_callers(self, handle: Handler) -> Handler:
         needed = self.dependant.dependencies
         if not any(_uses(dependant, deps.caller_of) for dependant in needed):
             return handle
@@ -54,6 +92,29 @@ class CallerRoute(APIRoute):
         return handle_for_caller
 
 
+def _finishing(handle: Handler) -> Handler:
+    """A handler whose replies are completed: conditions, HEAD, and what decided on their format."""
+
+    @wraps(handle)
+    async def finish(request: Request) -> Response:
+        response = await handle(request)
+        if NEGOTIATED in request.scope:
+            response.headers.add_vary_header("Accept")
+        if request.method == "OPTIONS":
+            response.headers["Allow"] = ", ".join(allowed_methods(request.scope))
+        reply: Response | None = None
+        try:
+            reply = answer_conditions(request, response)
+            if HEAD in request.scope:
+                reply = without_body(reply)
+        finally:
+            if reply is not response and isinstance(response, Streamed):
+                await response.discard()
+        return reply
+
+    return finish
+
+
 def _uses(dependant: Dependant, call: Callable[..., Any]) -> bool:
     """Whether a dependency is this function or has it below it."""
     return dependant.call is call or any(_uses(below, call) for below in dependant.dependencies)
@@ -70,16 +131,15 @@ async def _solve(guards: Dependant, request: Request) -> None:
 
 
 async def _check_and_handle(handle: Handler, request: Request, body: bytes) -> Response:
-    """The reply of an endpoint to a JSON body, unless the body has a value that JSON does not have.
+    """The reply of an endpoint to a body, unless it is no JSON.
 
     A large body is checked in a thread, where it delays nobody else.
     """
+    content_type = request.headers.get("content-type")
     if len(body) <= ANONYMOUS_BODY_BYTES:
-        problem = unusable_body(body)
+        refuse_no_json(content_type, body)
     else:
-        problem = await run_in_threadpool(unusable_body, body)
-    if problem is not None:
-        raise HTTPException(422, problem)
+        await run_in_threadpool(refuse_no_json, content_type, body)
     return await handle(request)
 
 

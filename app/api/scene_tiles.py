@@ -2,10 +2,11 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Depends, Response
 
 from app.api.deps import DatabaseDep, Reader, StorageDep
 from app.api.jobs import JobId
+from app.api.paths import PathNumber
 from app.api.routes import CallerRoute
 from app.api.tiles import refuse_other_matrix_set
 from app.usecases import jobs
@@ -14,7 +15,7 @@ from services.formats.images.map_tiles import tile_media_type
 from services.orthorectification.tile_limits import TilePlace
 
 
-async def _place(matrix_set: str, z: int, y: int, x: int) -> TilePlace:
+async def _place(matrix_set: str, z: PathNumber, y: PathNumber, x: PathNumber) -> TilePlace:
     refuse_other_matrix_set(matrix_set)
     return TilePlace(z, y, x)
 
@@ -36,7 +37,6 @@ def map_tile(
     job_id: JobId,
     layer: Layer,
     place: TilePlaceDep,
-    request: Request,
     database: DatabaseDep,
     storage: StorageDep,
     caller: Reader,
@@ -51,6 +51,4 @@ def map_tile(
     # Results never change; browsers ask again each time, so that the token is checked for every tile.
     tag = f'"{job.id}-{job.attempt}"'
     headers = {"ETag": tag, "Cache-Control": "private, no-cache", "X-Content-Type-Options": "nosniff"}
-    if request.headers.get("if-none-match") == tag:
-        return Response(status_code=304, headers=headers)
     return Response(tile, media_type=tile_media_type(tile), headers=headers)

@@ -11,8 +11,9 @@ from fastapi import APIRouter, BackgroundTasks, Query, Request, Response, status
 from pydantic import BaseModel, Field
 
 from app.api.body import BINARY_BODY, announced_length
+from app.api.conditions import is_conditional, refuse_change
 from app.api.deps import DatabaseDep, InstallationDep, Registrar, SettingsDep, StorageDep, UploadTurn
-from app.api.files import file_reply
+from app.api.files import file_reply, validators
 from app.api.models import scenes as models
 from app.api.models.base import stated_accuracy
 from app.api.models.scenes import Scene, Scenes, StoredFile
@@ -21,7 +22,7 @@ from app.api.sent_body import sent_chunks
 from app.db.scene_registrations import SceneRegistration
 from app.db.scenes import SceneRow
 from app.db.tokens import Token
-from app.errors import InputError
+from app.errors import InputError, NotFound
 from app.usecases import scenes
 from app.usecases.features.stac import scene_media_type
 from app.usecases.installation import Installation
@@ -89,7 +90,12 @@ def upload_beside(
     installation: InstallationDep,
     caller: Registrar,
 ) -> StoredFile:
-    """Upload a side file of a scene: model, terrain, mask or check points."""
+    """Upload a side file of a scene: model, terrain, mask or check points.
+
+    With `If-Match` it replaces the file that has this tag alone, with `If-None-Match: *` none.
+    """
+    if is_conditional(request):
+        refuse_change(request, _stored(installation, caller, scene_id, name))
     sent = _sent_file(request, installation, caller, name)
     stored = scenes.upload_side_file(installation, caller, scene_id, sent)
     return StoredFile(
@@ -99,12 +105,18 @@ def upload_beside(
 
 @router.get("/scenes/{scene_id}/files/{name}", response_class=Response)
 def download_file(
-    *, scene_id: UUID, name: str, database: DatabaseDep, storage: StorageDep, caller: Registrar
+    *,
+    scene_id: UUID,
+    name: str,
+    request: Request,
+    database: DatabaseDep,
+    storage: StorageDep,
+    caller: Registrar,
 ) -> Response:
     """Return the image or a side file of a scene as it was uploaded."""
     with database.reading() as connection:
         key = scenes.file_key(connection, caller, scene_id, name)
-    return file_reply(storage, key, scene_media_type(name))
+    return file_reply(request, storage, key, scene_media_type(name))
 
 
 @router.post("/scenes/reference", status_code=status.HTTP_201_CREATED)
@@ -193,6 +205,18 @@ def _registration(row: SceneRegistration) -> models.SceneRegistration:
         created=row.created_at,
         finished=row.finished_at,
     )
+
+
+def _stored(
+    installation: Installation, caller: Token, scene_id: UUID, name: str
+) -> dict[str, str] | None:
+    """The validators of a file of a scene; None without such a file."""
+    try:
+        with installation.database.reading() as connection:
+            key = scenes.file_key(connection, caller, scene_id, name)
+        return validators(key, installation.storage.state(key))
+    except NotFound:
+        return None
 
 
 def _sent_file(

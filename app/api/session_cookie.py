@@ -17,8 +17,8 @@ from app.errors import NotAllowed
 
 COOKIE = "amers_session"
 LIFETIME_S = 3600
-ENDED_SESSION = "amers.ended_session"
-"""In the scope of a request whose session serves no longer: the reply removes its cookie."""
+ENDED_SESSION = "ended_session"
+"""In the state of a request whose session serves no longer: the reply removes its cookie."""
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,14 @@ from app.api.credentials import refuse_other_sites
 from app.api.deps import DatabaseDep, SecretDep
 from app.api.negotiation import refuse_unknown
 from app.api.pages import Page, document_page
+from app.api.routes import CallerRoute
 from app.api.session_cookie import COOKIE, LIFETIME_S, Session, format_session, parse_session, removal
 from app.auth import authenticate
 from app.db.engine import Database
 from app.db.tokens import Token, end_session
 from app.errors import NotAllowed
 
-router = APIRouter(include_in_schema=False)
+router = APIRouter(include_in_schema=False, route_class=CallerRoute)
 
 PAGE = Page(
     "Sign in",

@@ -59,9 +59,13 @@ class Streamed(StreamingResponse):
         try:
             await super().stream_response(partial(self._send, send))
         finally:
-            with CancelScope(shield=True):
-                await to_thread.run_sync(self._close, limiter=self._thread)
-            self._release()
+            await self.discard()
+
+    async def discard(self) -> None:
+        """Give up the pieces that are not read yet, and release the connection."""
+        with CancelScope(shield=True):
+            await to_thread.run_sync(self._close, limiter=self._thread)
+        self._release()
 
     async def _all_pieces(self, first_pieces: Iterable[bytes]) -> AsyncIterator[bytes]:
         for piece in first_pieces:

@@ -5,6 +5,7 @@ import hashlib
 from fastapi import APIRouter, Request, Response
 
 from app.api.access import Public
+from app.api.conditions import if_held
 from app.api.deps import DatabaseDep
 from app.api.features import CollectionDep, ViewerDep
 from app.api.models.base import Link
@@ -18,6 +19,7 @@ from app.api.models.documents import (
     TileSets,
 )
 from app.api.negotiation import JSON, MVT
+from app.api.paths import PathNumber
 from app.api.routes import CallerRoute
 from app.db.features.collection import Collection
 from app.errors import NotFound
@@ -100,9 +102,9 @@ def tileset(
 def tile(
     *,
     matrix_set: str,
-    z: int,
-    y: int,
-    x: int,
+    z: PathNumber,
+    y: PathNumber,
+    x: PathNumber,
     request: Request,
     collection: CollectionDep,
     viewer: ViewerDep,
@@ -115,8 +117,9 @@ def tile(
         state = f"{version} {collection.id} {z} {y} {x} {viewer.is_admin}"
         tag = f'"{hashlib.sha256(state.encode()).hexdigest()[:20]}"'
         headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
-        if request.headers.get("if-none-match") == tag:
-            return Response(status_code=304, headers=headers)
+        held = if_held(request, headers)
+        if held is not None:
+            return held
         content = tiles.tile(connection, collection.id, z, y, x, viewer=viewer)
     return Response(content, media_type=MVT, headers=headers)
 

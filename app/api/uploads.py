@@ -33,6 +33,8 @@ from app.usecases.uploads import Busy, Checksum, NewUpload, Piece, WrongChecksum
 PIECE = "application/offset+octet-stream"
 ALGORITHMS = ("sha1", "sha256")
 EXTENSIONS = "creation,termination,checksum,expiration"
+UNSUPPORTED = {"Upload-Concat": "concatenation", "Upload-Defer-Length": "creation-defer-length"}
+"""Headers that ask for what the service does not do; an ordinary upload instead would mislead."""
 LOCKED, CHECKSUM_MISMATCH = 423, 460
 TUS = {"Tus-Resumable": VERSION, "Cache-Control": "no-store"}
 PIECE_BODY = {"content": {PIECE: {"schema": {"type": "string", "format": "binary"}}}}
@@ -40,16 +42,21 @@ PIECE_BODY = {"content": {PIECE: {"schema": {"type": "string", "format": "binary
 Size = Annotated[int, Header(ge=0)]
 
 
-async def _version(tus_resumable: Annotated[str | None, Header()] = None) -> None:
+async def _version(request: Request, tus_resumable: Annotated[str | None, Header()] = None) -> None:
     if tus_resumable != VERSION:
         detail = f"Tus-Resumable: {tus_resumable} found, {VERSION} expected"
         raise HTTPException(412, detail, {"Tus-Version": VERSION})
+    for header, extension in UNSUPPORTED.items():
+        if header in request.headers:
+            detail = f"{header}: this service has no tus extension {extension}, only {EXTENSIONS}"
+            raise HTTPException(400, detail, {"Tus-Extension": EXTENSIONS})
 
 
 Version = Depends(_version)
 router = APIRouter(prefix="/uploads", tags=["uploads"], route_class=CallerRoute)
 
 
+@router.options("/{upload_id}", status_code=204, dependencies=[Public], include_in_schema=False)
 @router.options("", status_code=204, dependencies=[Public])
 def capabilities(*, settings: SettingsDep) -> Response:
     """Return the version and the extensions of tus that the service supports."""

@@ -5,6 +5,7 @@ from app.storage.chips import StoredChips
 from app.storage.folder import (
     KEY,
     UNFINISHED,
+    FileState,
     RangeReader,
     Storage,
     StoredFile,
@@ -17,6 +18,7 @@ __all__ = [
     "KEY",
     "MARKER",
     "UNFINISHED",
+    "FileState",
     "Marker",
     "RangeReader",
     "Storage",

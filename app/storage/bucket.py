@@ -14,7 +14,7 @@ from obstore.exceptions import BaseError
 from obstore.store import S3Store
 
 from app.errors import InputError, NotFound, StorageOutage
-from app.storage.folder import COPY_BYTES, RangeReader, Storage, checked_key
+from app.storage.folder import COPY_BYTES, FileState, RangeReader, Storage, checked_key
 
 RETRIES = 3
 RETRY_TIMEOUT = timedelta(seconds=20)
@@ -90,8 +90,14 @@ class BucketStorage(Storage):
 
     def size(self, key: str) -> int:
         """The size of a file, bytes."""
+        return self.state(key).size_bytes
+
+    def state(self, key: str) -> FileState:
+        """The size of a file, its time, and a text that changes with its content."""
         with _storage_errors(key):
-            return int(obstore.head(self.store, checked_key(key))["size"])
+            found = obstore.head(self.store, checked_key(key))
+        modified_s = found["last_modified"].timestamp()
+        return FileState(int(found["size"]), modified_s, f"{modified_s}-{found['e_tag']}")
 
     def exists(self, key: str) -> bool:
         """Whether there is a file of this key."""

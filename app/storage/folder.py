@@ -34,6 +34,20 @@ class StoredFile:
     sha256: str
 
 
+@dataclass(frozen=True)
+class FileState:
+    """What identifies the content of a file without reading it.
+
+    Attributes:
+        modified_s: when it was stored, seconds since 1970.
+        version: a text that changes with the content.
+    """
+
+    size_bytes: int
+    modified_s: float
+    version: str
+
+
 class RangeReader(Protocol):
     """An open file of the storage that is read by position; threads may share it."""
 
@@ -202,6 +216,11 @@ class Storage:
     def size(self, key: str) -> int:
         """The size of a file, bytes."""
         return self.path(key).stat().st_size
+
+    def state(self, key: str) -> FileState:
+        """The size of a file, its time, and a text that changes with its content."""
+        found = self.path(key).stat()
+        return FileState(found.st_size, found.st_mtime, f"{found.st_mtime_ns:x}-{found.st_size:x}")
 
     def local(self, key: str) -> Path | None:
         """The path of a file on this machine; None if the storage is a bucket.

@@ -3,18 +3,22 @@
 The policy allows no other site, except that of the background of the map where a setting names one.
 """
 
-from hashlib import sha256
+from email.utils import formatdate
 from mimetypes import guess_type
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from fastapi import APIRouter, Request, Response
+from fastapi.responses import RedirectResponse
 from pydantic import BaseModel
 
+from app.api.conditions import tag_of
+from app.api.paths import SLASH
+from app.api.routes import CallerRoute
 from app.config import Settings
 from app.errors import NotFound
 
-router = APIRouter(include_in_schema=False)
+router = APIRouter(include_in_schema=False, route_class=CallerRoute)
 
 BUILT = Path(__file__).parent / "built"
 POLICY = "; ".join(
@@ -54,7 +58,9 @@ class Background(BaseModel):
 
 @router.get("/map")
 def page(request: Request) -> Response:
-    """Return the page."""
+    """Return the page, whose links lead beside it: at `/map/` they would lead below it."""
+    if SLASH in request.scope:
+        return RedirectResponse("../map")
     return _file(request, "index.html")
 
 
@@ -78,7 +84,7 @@ def policy(settings: Settings) -> str:
 
 
 def _file(request: Request, name: str) -> Response:
-    """A file of the page, compressed if the browser accepts that; status 304 if the browser has it.
+    """A file of the page, compressed if the browser accepts that.
 
     Raises:
         NotFound: the page has no such file, or is not built in this installation.
@@ -93,8 +99,7 @@ def _file(request: Request, name: str) -> Response:
         path = BUILT / f"{name}.gz"
         headers["Content-Encoding"] = "gzip"
     content = path.read_bytes()
-    headers["ETag"] = f'"{sha256(content).hexdigest()[:32]}"'
-    if request.headers.get("if-none-match") == headers["ETag"]:
-        return Response(status_code=304, headers=headers)
+    headers["ETag"] = tag_of(content)
+    headers["Last-Modified"] = formatdate(path.stat().st_mtime, usegmt=True)
     kind = guess_type(name)[0] or "application/octet-stream"
     return Response(content, media_type=kind, headers=headers)

@@ -137,19 +137,17 @@ def test_replies_to_uploads_name_the_version_of_tus_whatever_they_say(
     me = bearer("register")
     url = begun(client, me)
     offset = {"Upload-Offset": "5"}
-    nobody = "/uploads/00000000-0000-0000-0000-000000000001"
     replies = {
         400: client.patch(
             url, headers=me | TUS | PIECE | {"Upload-Offset": "0", "Upload-Checksum": "md5 x"}
         ),
         401: client.head(url, headers=TUS),
-        404: client.head(nobody, headers=me | TUS),
+        404: client.head("/uploads/no-id", headers=me | TUS),
         405: client.put(url, headers=me | TUS),
         409: client.patch(url, content=b"x", headers=me | TUS | PIECE | offset),
         412: client.head(url, headers=me),
         413: client.patch(url, content=TIFF * 2, headers=me | TUS | PIECE | {"Upload-Offset": "0"}),
         415: client.patch(url, content=b"x", headers=me | TUS | offset),
-        422: client.head("/uploads/no-id", headers=me | TUS),
     }
     for status, reply in replies.items():
         assert (reply.status_code, reply.headers.get("tus-resumable")) == (status, "1.0.0"), reply.text
