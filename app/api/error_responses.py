@@ -128,11 +128,17 @@ def _malformed(request: Request, error: Exception) -> JSONResponse:
         {"field": ".".join(map(str, item["loc"])), "message": _message(item)} for item in error.errors()
     ]
     detail = "; ".join(f"{item['field']}: {item['message']}" for item in wrong)
+    names = [f"{item['loc'][-1]} {item['input']!r:.60}" for item in error.errors() if _in_path(item)]
+    if names:
+        return problem(404, f"there is no {', '.join(names)}", error=NotFound.__name__, errors=wrong)
     places = {item["loc"][0] for item in error.errors()}
-    if "path" in places:
-        return problem(404, f"nothing has this path: {detail}", error=NotFound.__name__, errors=wrong)
     # OGC API requires 400 for a wrong parameter of the query; a wrong body is 422.
     return problem(422 if "body" in places else 400, detail, error="InputError", errors=wrong)
+
+
+def _in_path(item: dict[str, Any]) -> bool:
+    """Whether an error is about a part of the path, which then names nothing."""
+    return bool(item["loc"][0] == "path")
 
 
 def _message(item: dict[str, Any]) -> str:

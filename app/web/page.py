@@ -60,7 +60,7 @@ class Background(BaseModel):
 def page(request: Request) -> Response:
     """Return the page, whose links lead beside it: at `/map/` they would lead below it."""
     if SLASH in request.scope:
-        return RedirectResponse("../map")
+        return RedirectResponse(f"{request.base_url}map")
     return _file(request, "index.html")
 
 

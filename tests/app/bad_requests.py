@@ -347,7 +347,7 @@ PLACES = [
     Bad("point that is a text", "GET", f"{ITEMS}/first", "", "read"),
     Bad("point beyond all numbers", "GET", f"{ITEMS}/{HUGE}", "", "read"),
     Bad("point beyond 64 bits", "GET", f"{ITEMS}/{2**63}", "", "read"),
-    Bad("point that is negative", "GET", f"{ITEMS}/-1", "no point", "read", 404),
+    Bad("point that is negative", "GET", f"{ITEMS}/-1", "no point_id '-1'", "read", 404),
     Bad("point in an unknown system", "GET", f"{ITEMS}/<point>?crs=urn:x", "crs", "read"),
     Bad("chips in an unknown format", "GET", f"{ITEMS}/<point>/chips?f=exe", "f", "read"),
     Bad("chip of a view that is not there", "GET", f"{ITEMS}/<point>/chips/9999", "", "read", 404),

@@ -157,7 +157,7 @@ def test_points_are_open_without_a_token_only_if_the_setting_allows_it(client, s
 def test_a_part_of_a_path_that_names_nothing_is_named(client):
     problem = refused(client.get("/number/seven"), 404)
     assert problem["errors"][0]["field"] == "path.number"
-    assert "path.number" in problem["detail"]
+    assert "no number 'seven'" in problem["detail"]
 
 
 def test_an_unknown_path_is_a_problem_too(client):
