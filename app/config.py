@@ -173,7 +173,7 @@ class Settings(BaseSettings):
     @classmethod
     def _public(cls, url: str | None) -> str | None:
         try:
-            return None if url is None else normal_public_url(url)
+            return normal_public_url(url) if url and url.strip() else None
         except ValueError as fault:
             raise PydanticCustomError("address", "{fault}", {"fault": str(fault)}) from None
 
