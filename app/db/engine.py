@@ -124,8 +124,12 @@ def opened(settings: Settings) -> Iterator[Database]:
 
 
 @contextmanager
-def pooled(dsn: str, settings: Settings) -> Iterator[Database]:
-    """Engines on a database, whatever its schema; a connection that is cut is noticed within seconds."""
+def pooled(dsn: str, settings: Settings, *, lock_wait_s: float | None = None) -> Iterator[Database]:
+    """Engines on a database, whatever its schema; a connection that is cut is noticed within seconds.
+
+    Args:
+        lock_wait_s: longest wait of what writes for what others hold; None: that of all sessions.
+    """
     reading = {
         "default_transaction_read_only": "on",
         "statement_timeout": f"{round(1000 * settings.read_timeout_seconds)}",
@@ -152,7 +156,8 @@ def pooled(dsn: str, settings: Settings) -> Iterator[Database]:
         "pool_reset_on_return": None,
     }
     reader = _engine(dsn, reading, **pool, **autocommit)
-    writer = _engine(dsn, {}, **pool)
+    writing = {} if lock_wait_s is None else {"lock_timeout": f"{lock_wait_s:g}s"}
+    writer = _engine(dsn, writing, **pool)
     try:
         yield Database(dsn, reader, writer)
     finally:

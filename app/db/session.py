@@ -38,6 +38,8 @@ PATIENCE: dict[str, Any] = {
     "keepalives_count": 3,
 }
 """Parameters of a connection, unless the address has its own: what is cut is noticed within seconds."""
+LOCK_WAIT = "60s"
+"""Longest wait for what others hold: a transaction that somebody left open holds it for ever."""
 SETTINGS: dict[str, str] = {
     # What values look like, in both directions.
     "client_encoding": "UTF8",
@@ -65,7 +67,7 @@ SETTINGS: dict[str, str] = {
     "default_transaction_isolation": "read committed",
     "default_transaction_deferrable": "off",
     "statement_timeout": "0",
-    "lock_timeout": "0",
+    "lock_timeout": LOCK_WAIT,
     "idle_in_transaction_session_timeout": "0",
     "idle_session_timeout": "0",
     "transaction_timeout": "0",

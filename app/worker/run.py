@@ -30,7 +30,12 @@ def main(arguments: list[str]) -> int:
     assert settings.database_url is not None, "the worker sets AMERS_DATABASE_URL"
     origin = Origin(actor_name=f"worker {worker}", job_id=UUID(job_id))
     try:
-        with working_for(origin), pooled(settings.database_url.get_secret_value(), settings) as database:
+        url = settings.database_url.get_secret_value()
+        # The worker ends what waits longer than a job may take.
+        with (
+            working_for(origin),
+            pooled(url, settings, lock_wait_s=settings.job_seconds) as database,
+        ):
             limit_memory(int(memory_bytes))
             limit_files(settings.job_file_bytes)
             do_attempt(database, settings, UUID(job_id), int(attempt))

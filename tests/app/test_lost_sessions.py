@@ -21,7 +21,10 @@ import app.cli
 from app.cli.commands import COMMANDS
 from app.cli.exit_status import FAILURE, REFUSED, SUCCESS
 from app.cli.on_demand import Command
+from app.db import session
+from app.db.cluster import backup
 from app.db.cluster.embedded import ROLE, SUPERUSER, Cluster
+from app.usecases.blocks import deletion
 from tests.app.conftest import EMPTY_TEMPLATE, TEMPLATE
 from tests.app.session_relay import Ending, Relay, relayed
 from tests.app.store_commands import (
@@ -59,6 +62,10 @@ READING = {
     "token list",
 }
 """Commands that change nothing in the database of the small installation."""
+UNLOCKED = {"spatial_ref_sys", "alembic_version"}
+"""The first belongs to PostGIS; the second is read by each command before it works."""
+ADVISORY_LOCKS = (0x616D657273,)
+"""Of upgrades."""
 DRAWN = 12
 """Statements of one command that `make test-thorough` tries."""
 
@@ -159,7 +166,8 @@ def lose(installations: Installations, folder: Path, command: str, number: int, 
 
 def check_ending(command: str, done: Done) -> None:
     """A command has succeeded all the same, or has said in one sentence that it has not."""
-    failed = {FAILURE, REFUSED} if command in OF_POSTGRES else {FAILURE}
+    is_early = "cannot be reached" in done.stderr
+    failed = {FAILURE, REFUSED} if is_early or command in OF_POSTGRES else {FAILURE}
     assert done.returncode in failed | {SUCCESS}, (done.returncode, done.stderr)
     assert "Traceback" not in done.stderr
     if done.returncode != SUCCESS:
@@ -224,6 +232,33 @@ def test_a_command_on_a_read_only_database_reads_or_says_that_it_cannot_write(
         assert done.returncode == SUCCESS, done.stderr
     else:
         assert "read-only" in done.stderr
+
+
+@pytest.mark.parametrize("command", sorted(set(STORE_COMMANDS) - LONG_WORK))
+def test_a_command_does_not_wait_for_ever_for_what_others_hold(
+    installations: Installations,
+    tmp_path: Path,
+    command: str,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """Somebody has left a transaction open that holds all tables, and all that has a lock of its own."""
+    monkeypatch.setitem(session.SETTINGS, "lock_timeout", "200ms")
+    monkeypatch.setattr(backup, "LOCK_WAIT", "200ms")
+    monkeypatch.setattr(deletion, "LONGEST_WAIT_S", 0.2)
+    with installations.new(tmp_path, command) as place, psycopg.connect(place.dsn) as other:
+        tables = other.execute("select tablename from pg_tables where schemaname = 'public'")
+        names = [sql.Identifier(name) for (name,) in tables if name not in UNLOCKED]
+        if names:
+            other.execute(
+                sql.SQL("lock table {} in access exclusive mode").format(sql.SQL(", ").join(names))
+            )
+        for number in ADVISORY_LOCKS:
+            other.execute("select pg_advisory_xact_lock(%s)", [number])
+        hurried = {**place.environment, "AMERS_READ_TIMEOUT_SECONDS": "0.2"}
+        with limited(LONGEST_S):
+            done = amers_here([*command.split(), *STORE_COMMANDS[command](place)], hurried)
+    check_ending(command, done)
+    assert done.returncode != SUCCESS or command in {"db status", "db restore"}
 
 
 @pytest.mark.parametrize("command", sorted(set(STORE_COMMANDS) - LONG_WORK))

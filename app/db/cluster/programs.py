@@ -39,7 +39,9 @@ def run_program(dsn: str, name: str, *arguments: str) -> str:
     environment = os.environ | {"LC_ALL": "C"}
     if password is not None:
         environment["PGPASSWORD"] = password
-    command = [str(_find_program(dsn, name)), f"--dbname={make_conninfo(**address)}", *arguments]
+    # It would ask on the terminal for a password, and wait.
+    program = [str(_find_program(dsn, name)), "--no-password"]
+    command = [*program, f"--dbname={make_conninfo(**address)}", *arguments]
     ended = _run(command, environment)
     if ended.returncode != 0:
         raise InputError(_reason(name, ended.stderr))
