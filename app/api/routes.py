@@ -15,6 +15,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.routing import Match
 from starlette.types import Receive, Scope, Send
 
+from app import reserve
 from app.api import deps
 from app.api.body import ANONYMOUS_BODY_BYTES, body_of
 from app.api.conditions import answer_conditions
@@ -24,9 +25,11 @@ from app.api.negotiation import NEGOTIATED
 from app.api.open_connections import network_of
 from app.api.streams import Streamed
 from app.api.turns import Turns
+from app.config import Settings
 from app.db.tokens import Token
 
 Handler = Callable[[Request], Coroutine[Any, Any, Response]]
+Reply = Callable[[], Coroutine[Any, Any, Response]]
 
 
 class CallerRoute(APIRoute):
@@ -76,16 +79,19 @@ class CallerRoute(APIRoute):
             return handle
         takes_upload = any(_uses(dependant, deps.takes_upload) for dependant in needed)
         guards = Dependant(dependencies=[item for item in needed if _uses(item, deps.caller_of)])
+        deletes = "DELETE" in (self.methods or ())
         has_body = self.body_field is not None
 
         async def handle_for_caller(request: Request) -> Response:
             caller = await deps.identify(request)
-            reply = partial(handle, request)
+            reply: Reply = partial(handle, request)
             if has_body:
                 await _solve(guards, request)
                 if caller is not None:
                     body_of(request).accept_from_caller()
                 reply = partial(_check_and_handle, handle, request, await request.body())
+            if deletes:
+                reply = partial(_without_reserve, reply, request.app.state.settings)
             turns: Turns = request.app.state.uploads if takes_upload else request.app.state.turns
             return await _in_turn(turns, _key(request, caller), reply)
 
@@ -143,6 +149,16 @@ async def _check_and_handle(handle: Handler, request: Request, body: bytes) -> R
     return await handle(request)
 
 
+async def _without_reserve(reply: Reply, settings: Settings) -> Response:
+    """The reply to a deletion; on a full disk it is tried again without the reserve."""
+    try:
+        return await reply()
+    except Exception as error:
+        if not reserve.is_full(error) or not await run_in_threadpool(reserve.give_up, settings):
+            raise
+    return await reply()
+
+
 def _key(request: Request, caller: Token | None) -> Hashable:
     """Whose turns a request takes: those of its token, or of its address."""
     if caller is not None:
@@ -150,9 +166,7 @@ def _key(request: Request, caller: Token | None) -> Hashable:
     return network_of(request.scope["client"][0]) if request.scope.get("client") else None
 
 
-async def _in_turn(
-    turns: Turns, key: Hashable, handle: Callable[[], Coroutine[Any, Any, Response]]
-) -> Response:
+async def _in_turn(turns: Turns, key: Hashable, handle: Reply) -> Response:
     """The reply of an endpoint; a reply in pieces keeps the turn while it reads from the database."""
     await turns.take(key)
     response = None

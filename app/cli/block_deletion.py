@@ -5,6 +5,7 @@ from typing import Annotated
 import typer
 
 from app.cli.block_listing import block_row
+from app.cli.deletion import giving_up_reserve
 from app.cli.output import AsJson, show_one
 from app.config import read_settings
 from app.db import engine
@@ -13,6 +14,7 @@ from app.usecases.blocks.deletion import delete_block
 from app.usecases.installation import Installation
 
 
+@giving_up_reserve
 def delete(
     reference: Annotated[str, typer.Argument(help="ID@VERSION, written out.")],
     as_json: AsJson = False,

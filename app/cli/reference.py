@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from app.cli.deletion import giving_up_reserve
 from app.cli.output import AsJson, Row, show, show_one
 from app.cli.transaction import transaction
 from app.config import read_settings
@@ -50,6 +51,7 @@ def list_references(as_json: AsJson = False) -> None:
     show([_record(row) for row in rows], as_json=as_json)
 
 
+@giving_up_reserve
 def remove(name: Annotated[str, typer.Argument(help="Name of the reference.")]) -> None:
     """Remove a reference image from the installation; its files stay in their folder."""
     with transaction() as connection:

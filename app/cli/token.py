@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from app.cli.deletion import giving_up_reserve
 from app.cli.output import AsJson, Row, show, show_one
 from app.cli.transaction import transaction
 from app.db.tokens import Token
@@ -53,6 +54,7 @@ def list_tokens(as_json: AsJson = False) -> None:
     show([_record(token) for token in all_tokens], as_json=as_json)
 
 
+@giving_up_reserve
 def revoke(
     name_or_id: Annotated[str, typer.Argument(help="Id of the token, or its name if it is unique.")],
     as_json: AsJson = False,

@@ -25,6 +25,7 @@ import psycopg
 from psycopg.conninfo import make_conninfo
 from psycopg.pq import PGconn, Ping
 
+from app import reserve
 from app.config import Settings
 from app.db import session
 from app.db.address import check_address
@@ -231,6 +232,7 @@ class Cluster:
             self._initialise(user)
         if self.is_running():
             return
+        reserve.give_up_for_start(self.folder)
         self._make_socket_folder(user)
         self._configure(user)
         self._forget_dead_server()
