@@ -4,7 +4,7 @@ import hashlib
 import random
 import time
 from base64 import b64encode
-from contextlib import suppress
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,6 +14,7 @@ from tests.app.flat_world import SIGMA_M
 
 ENDED = ("successful", "failed", "dismissed")
 BROKEN = {500, 501, 502, 504}
+OUTAGES = {503, 507}
 LONGEST_PIECE_BYTES = 600_000
 TUS = {"Tus-Resumable": "1.0.0"}
 
@@ -28,6 +29,9 @@ class Caller:
         scenes: id to checksum of the images that were accepted.
         jobs: id to the scene, the name of the block, or the box of the export.
         unexpected: replies that no outage explains.
+        refused: how often each reason for a 503 or 507 was given.
+        longest_s: time of the slowest request, and what it was.
+        n_timeouts: requests without a reply within the timeout of the client.
     """
 
     client: httpx.Client
@@ -36,6 +40,9 @@ class Caller:
     scenes: dict[str, str] = field(default_factory=dict)
     jobs: dict[str, str] = field(default_factory=dict)
     unexpected: list[str] = field(default_factory=list)
+    refused: "Counter[str]" = field(default_factory=Counter)
+    longest_s: tuple[float, str] = (0.0, "")
+    n_timeouts: int = 0
 
     def ask(self, method: str, path: str, **more: Any) -> httpx.Response:
         """The reply to a request, which is repeated while the service or its database is down.
@@ -52,12 +59,22 @@ class Caller:
 
     def try_once(self, method: str, path: str, **more: Any) -> httpx.Response | None:
         """The reply to a request; None while the service or its database is down."""
-        with suppress(httpx.TransportError):
+        began = time.monotonic()
+        try:
             reply = self.client.request(method, path, **more)
-            if reply.status_code in BROKEN:
-                self.unexpected.append(f"{method} {path}: {reply.status_code} {reply.text[:200]}")
-            elif reply.status_code != 503:
-                return reply
+        except httpx.TimeoutException:
+            self.n_timeouts += 1
+            return None
+        except httpx.TransportError:
+            return None
+        finally:
+            self.longest_s = max(self.longest_s, (time.monotonic() - began, f"{method} {path}"))
+        if reply.status_code in BROKEN:
+            self.unexpected.append(f"{method} {path}: {reply.status_code} {reply.text[:200]}")
+        elif reply.status_code in OUTAGES:
+            self.refused[str(reply.json().get("detail"))] += 1
+        else:
+            return reply
         return None
 
     def register(self, image: bytes, passes: int, key: str) -> None:

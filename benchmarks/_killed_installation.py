@@ -78,6 +78,8 @@ class KilledInstallation:
             exponentially distributed.
         killed: how often each kind of process was.
         finished_backups: folders of the backups whose command reported success.
+        longest_backup_s: time of the slowest backup that was not killed.
+        hung: backups that did not end in time.
     """
 
     folder: Path
@@ -85,6 +87,8 @@ class KilledInstallation:
     kill_every_s: float
     killed: "Counter[str]" = field(default_factory=Counter)
     finished_backups: list[Path] = field(default_factory=list)
+    longest_backup_s: float = 0.0
+    hung: list[str] = field(default_factory=list)
     _services: dict[str, Service] = field(default_factory=dict)
     _threads: list[threading.Thread] = field(default_factory=list)
     _stop: threading.Event = field(default_factory=threading.Event)
@@ -189,12 +193,17 @@ class KilledInstallation:
                 stdout=output,
                 stderr=output,
             )
+        began = time.monotonic()
         try:
             process.wait(kill_after_s if is_killed else PATIENCE_S)
+            self.longest_backup_s = max(self.longest_backup_s, time.monotonic() - began)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-            self.killed["backup"] += 1
+            if is_killed:
+                self.killed["backup"] += 1
+            else:
+                self.hung.append(f"{name}: the command did not end within {PATIENCE_S:g} s")
         if process.returncode == 0:
             self.finished_backups.append(self.backups / name)
 

@@ -2,7 +2,8 @@
 
 Scenes are uploaded whole and in pieces, and registered; blocks are ingested and exported; backups are
 made. Meanwhile the API, two workers, the processes of their jobs, PostgreSQL and running backups are
-killed (SIGKILL) again and again. A killed process is restarted within a second. At the end, every
+killed (SIGKILL) again and again. A killed process is restarted within a second. The storage is not
+mounted for some seconds, and the database is read-only, as often as asked for. At the end, every
 accepted upload and job must exist, every job must have ended once, every result, block and backup must
 be complete or absent, rows and files must refer to each other after the sweep, and the quotas of all
 owners must add up to what the storage holds.
@@ -17,6 +18,7 @@ import sys
 import tempfile
 import time
 from dataclasses import asdict, dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +28,16 @@ from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from benchmarks._faults_caller import Caller
 from benchmarks._faults_outcome import IMAGES, POINTS, check_outcome
-from benchmarks._killed_installation import KilledInstallation
+from benchmarks._killed_installation import PATIENCE_S, KilledInstallation
 from benchmarks._measuring import keep
+from benchmarks._outages import Outages
 from tests.app.flat_world import CENTRE, make_flat_world
 from tests.factories import make_block
 
 OPEN_AT_ONCE = 4
 LONGEST_RUN_S = 3600.0
+REQUEST_S = 15.0
+"""Timeout of the client."""
 MOST_PASSES = 30
 """Largest number of fine searches: one takes little time, many leave time to kill a process within."""
 HALF_EXPORT_DEG = 0.05
@@ -57,11 +62,20 @@ class Work:
         return tasks
 
 
-def run(folder: Path, work: Work, seed: int, kill_every_s: float) -> dict[str, Any]:
+def run(
+    folder: Path,
+    work: Work,
+    seed: int,
+    kill_every_s: float,
+    *,
+    unmounts: int = 0,
+    read_onlys: int = 0,
+) -> dict[str, Any]:
     """Run an installation whose processes are killed; returns requests, outcomes and errors.
 
     Args:
         folder: for all files; other users must be able to enter it.
+        unmounts, read_onlys: how often the storage is not mounted, and the database is read-only.
     """
     world = make_flat_world(folder / "world", size=800)
     image = world.tagged.read_bytes()
@@ -74,27 +88,56 @@ def run(folder: Path, work: Work, seed: int, kill_every_s: float) -> dict[str, A
             publish_block(connection, str(block.number))
         headers = {"Authorization": f"Bearer {installation.token()}"}
         installation.start_killing()
-        with httpx.Client(base_url=installation.url, headers=headers, timeout=15.0) as client:
+        outages = Outages(installation)
+        with httpx.Client(base_url=installation.url, headers=headers, timeout=REQUEST_S) as client:
             caller = Caller(client, str(installation.log), deadline)
             tasks = work.tasks(random.Random(seed))
+            due = _moments(len(tasks), unmounts, read_onlys)
             for number, task in enumerate(tasks):
+                if number in due:
+                    outages.begin(due[number])
                 _request(installation, caller, image, task, number)
                 caller.wait(OPEN_AT_ONCE - 1)
                 counts = ", ".join(f"{kind} {count}" for kind, count in installation.killed.items())
                 print(f"{number + 1} of {len(tasks)} requested; killed: {counts}", file=sys.stderr)
             caller.wait(0)
+            outages.wait()
             installation.stop_killing()
             installation.wait_ready()
     taken_s = time.monotonic() - started
     with installation.cluster.lease() as dsn:
         outcome = check_outcome(dsn, installation, caller)
+    outcome["wrong"] += [*outages.wrong, *installation.hung]
     return {
         **asdict(work),
         "seed": seed,
         "taken_s": round(taken_s, 1),
         "killed": dict(installation.killed),
+        "outages": dict(outages.had),
+        "refused": dict(caller.refused),
+        "acknowledged": {
+            "scenes": len(caller.scenes),
+            "jobs": len(caller.jobs),
+            "backups": len(installation.finished_backups),
+        },
+        "longest_request": caller.longest_s,
+        "limit_of_requests_s": REQUEST_S,
+        "timeouts": caller.n_timeouts,
+        "longest_backup_s": round(installation.longest_backup_s, 1),
+        "limit_of_backups_s": PATIENCE_S,
         **outcome,
     }
+
+
+def _moments(n_tasks: int, unmounts: int, read_onlys: int) -> dict[int, str]:
+    """The numbers of the tasks at which an outage begins, evenly among all, and its kind."""
+    kinds = [
+        kind
+        for pair in zip_longest(["storage"] * unmounts, ["database"] * read_onlys)
+        for kind in pair
+        if kind is not None
+    ]
+    return {(place + 1) * n_tasks // (len(kinds) + 1): kind for place, kind in enumerate(kinds)}
 
 
 def _request(
@@ -127,16 +170,18 @@ def main() -> int:
     parser.add_argument("--uploads", type=int, default=40)
     parser.add_argument("--exports", type=int, default=20)
     parser.add_argument("--backups", type=int, default=10)
+    parser.add_argument("--unmounts", type=int, default=2)
+    parser.add_argument("--read-onlys", type=int, default=2)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--kill-every-s", type=float, default=2.0)
     arguments = vars(parser.parse_args())
-    seed, kill_every_s = arguments.pop("seed"), arguments.pop("kill_every_s")
+    how = {name: arguments.pop(name) for name in ("seed", "kill_every_s", "unmounts", "read_onlys")}
     # The started processes end with this command, also when it is stopped.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(1))
     with tempfile.TemporaryDirectory(prefix="amers-faults-", dir="/tmp") as name:
         folder = Path(name)
         folder.chmod(0o755)
-        outcome = run(folder, Work(**arguments), seed, kill_every_s)
+        outcome = run(folder, Work(**arguments), **how)
     print(json.dumps(outcome, indent=1))
     keep("faults", outcome)
     return 1 if outcome["wrong"] else 0
