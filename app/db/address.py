@@ -14,15 +14,16 @@ SCHEMES = ("postgresql", "postgres")
 
 
 URL = re.compile(
-    r"postgres(?:ql)?://(?:(?P<user>[^:@/?#\s]*)(?::[^@/]*)?@)?(?P<hosts>[^@/?#]*)"
+    r"postgres(?:ql)?://(?:(?P<user>[^:@/?#\s]*)(?::(?:[^@/?]|\?(?!\w+=))*)?@)?(?P<hosts>[^@/?#]*)"
     r"(?:/(?P<name>[^@/?#]*))?(?:\?[^@#]*)?"
 )
 """An address that can be read in one way only: no part of a password can be taken for something else."""
-HOST = re.compile(r"(?:(?:[\w.%-]*|\[[0-9a-fA-F:.%\w]*\])(?::(?P<port>\d{1,5})?)?,?)*")
+HOST = r"(?:[\w.%-]*|\[[\w:.%]*\])(?::\d{1,5})?"
+HOSTS = re.compile(f"{HOST}(?:,{HOST})*")
 PAIR = re.compile(r"(?:^|\s)(\w+)\s*=")
 UNREADABLE = (
     f"{VARIABLE}: it cannot be read as the address of a database: give {EXPECTED}, with "
-    "characters such as @ / : % in the password written as %40 %2F %3A %25"
+    "characters such as @ / : % ? in the password written as %40 %2F %3A %25 %3F"
 )
 
 
@@ -62,7 +63,7 @@ def unreachable(error: psycopg.OperationalError, dsn: str) -> InputError:
 
 def _is_clear_url(url: str) -> bool:
     read = URL.fullmatch(url)
-    return read is not None and HOST.fullmatch(read["hosts"]) is not None
+    return read is not None and HOSTS.fullmatch(read["hosts"]) is not None
 
 
 def _are_clear_pairs(text: str) -> bool:

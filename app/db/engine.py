@@ -212,7 +212,9 @@ def _may_read_as_reader(dsn: str) -> bool:
         row = connection.execute(
             """select from pg_roles where rolname = %(role)s
                 and pg_has_role(current_user, oid, 'member')
-                and has_table_privilege(oid, to_regclass('block'), 'select')""",
+                and has_table_privilege(oid, to_regclass('block'), 'select')
+                and not exists (select from pg_extension where extname = 'postgis'
+                    and not has_schema_privilege(pg_roles.oid, extnamespace, 'usage'))""",
             {"role": READER},
         ).fetchone()
     return row is not None

@@ -157,9 +157,9 @@ def reach(dsn: str) -> DriverConnection:
     """A new connection of the driver.
 
     Raises:
-        InputError: the database cannot be reached.
+        InputError: the database cannot be reached, or not used in this way.
     """
     try:
         return session.connect(dsn)
-    except psycopg.OperationalError as error:
+    except (session.Unreachable, session.UnusableSession) as error:
         raise unreachable(error, dsn) from error

@@ -125,6 +125,10 @@ TOO_FEW = (
 )
 
 
+class Unreachable(psycopg.OperationalError):
+    """No connection can be made; the message is the driver's, and quotes parts of the address."""
+
+
 class UnusableSession(psycopg.OperationalError):
     """A session that can never have the settings of Amers; the message says what to change."""
 
@@ -137,9 +141,14 @@ def connect(dsn: str, more: Mapping[str, str] | None = None) -> DriverConnection
         more: further settings, in the order in which they are set.
 
     Raises:
-        psycopg.OperationalError: no connection can be made, or the session cannot be used.
+        Unreachable: no connection can be made.
+        UnusableSession: the session can never have these settings.
+        psycopg.Error: the session is lost before it has begun.
     """
-    connection: DriverConnection = psycopg.connect(patient(dsn))
+    try:
+        connection: DriverConnection = psycopg.connect(patient(dsn))
+    except psycopg.OperationalError as error:
+        raise Unreachable(str(error)) from error
     try:
         begin(connection.pgconn, dsn, more)
     except BaseException:

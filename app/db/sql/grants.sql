@@ -12,9 +12,10 @@ do $$ begin
     if not pg_has_role('amers_reader', 'member') then
         execute format('grant amers_reader to %I', current_user);
     end if;
-    grant usage on schema public to amers_reader;
-    grant select on all tables in schema public to amers_reader;
-    alter default privileges in schema public grant select on tables to amers_reader;
+    execute format('grant usage on schema %I to amers_reader', current_schema());
+    execute format('grant select on all tables in schema %I to amers_reader', current_schema());
+    execute format(
+        'alter default privileges in schema %I grant select on tables to amers_reader', current_schema());
 exception when insufficient_privilege then
     raise warning using message = format(
         'requests are read, in read-only transactions, with the rights of %1$I, because it may not use the '
