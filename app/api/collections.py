@@ -158,7 +158,10 @@ def schema(
     elif collection.interval:
         members[collection.interval[0]]["x-ogc-role"] = "primary-instant"
     members["geometry"] = {**geometry_schema(collection), "x-ogc-role": "primary-geometry"}
-    return _schema_reply(request, collection, "schema", members, f)
+    # A property that is not required may be unknown: null in GeoJSON and in files, nothing in CSV.
+    required = [item.name for item in collection.queryables.values() if not item.nullable]
+    required += [] if collection.geometry_nullable else ["geometry"]
+    return _schema_reply(request, collection, "schema", members, f, required=required)
 
 
 def describe(
@@ -220,7 +223,13 @@ def _self_links(request: Request, path: str) -> list[Link]:
 
 
 def _schema_reply(
-    request: Request, collection: Collection, name: str, members: dict[str, Any], f: str | None
+    request: Request,
+    collection: Collection,
+    name: str,
+    members: dict[str, Any],
+    f: str | None,
+    *,
+    required: list[str] | None = None,
 ) -> Response:
     refuse_unknown(request, {"f"})
     path = f"collections/{collection.id}/{name}"
@@ -245,6 +254,7 @@ def _schema_reply(
         type="object",
         title=collection.title,
         properties=members,
+        required=required,
         additional_properties=False,
     )
     return json_reply(document, SCHEMA_JSON)

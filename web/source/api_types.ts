@@ -216,6 +216,7 @@ export interface JsonSchema {
   type: "object";
   title: string;
   properties: Record<string, unknown>;
+  required?: string[];
   additionalProperties: boolean;
 }
 

@@ -100,6 +100,7 @@ class JsonSchema(Reply):
     type: Literal["object"]
     title: str
     properties: JsonObject
+    required: list[str] | None = Missing
     additional_properties: bool = Field(serialization_alias="additionalProperties")
 
 

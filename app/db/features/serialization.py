@@ -61,7 +61,8 @@ def csv_text(layout: Layout) -> ColumnElement[str]:
         position = [cast(axis(geometry), Text()) for axis in axes]
     else:
         wkt = func.st_astext(geometry, integer_constant(DEGREE_DIGITS), type_=Text())
-        position = [QUOTE.concat(wkt).concat(QUOTE)]
+        # `concat_ws` leaves out what is null: the columns after it would move.
+        position = [func.coalesce(QUOTE.concat(wkt).concat(QUOTE), text_constant(""))]
     values = [_csv(collection.key), *position, *(_csv(item) for item in layout.properties)]
     return func.concat_ws(text_constant(","), *values, type_=Text())
 

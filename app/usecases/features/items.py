@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 
 import psycopg
@@ -89,8 +89,7 @@ def table(
     except psycopg.DataError as error:
         raise _invalid_filter(error) from error
     columns = [
-        Column(item.name, "text" if item.is_time else item.type)
-        for item in (selection.collection.key, *selection.properties)
+        Column(item.name, item.type) for item in (selection.collection.key, *selection.properties)
     ]
     features, last_keys = read_feature_csv(
         text, columns, selection.collection.geometry_type, selection.crs.srid, query.limit
@@ -98,7 +97,8 @@ def table(
     last = None if last_keys is None else tuple(json.loads(last_keys))
     matched = _matched(connection, query, last, len(features))
     next_token = _next(query, last, matched, secret)
-    return features, FeaturePage(b"", len(features), matched, next_token)
+    table = replace(features, is_sorted=bool(selection.order))
+    return table, FeaturePage(b"", len(features), matched, next_token)
 
 
 def stream(connection: Connection, query: ResolvedQuery, secret: bytes) -> Iterator[bytes | FeaturePage]:

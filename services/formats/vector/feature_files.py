@@ -25,6 +25,8 @@ ARROW_TYPES = {
     "double precision": pa.float64(),
     "text": pa.string(),
     "boolean": pa.bool_(),
+    "date": pa.date32(),
+    "timestamptz": pa.timestamp("us", "UTC"),
 }
 
 
@@ -45,11 +47,13 @@ class FeatureTable:
         geometry_type: in the terms of GeoPackage, with Z where there are heights; MultiPolygon for all
             when one polygon has several parts, being cut at the antimeridian.
         srid: EPSG code of the coordinates.
+        is_sorted: whether the order of the rows means something, and files keep it.
     """
 
     rows: pa.Table
     geometry_type: str
     srid: int
+    is_sorted: bool = False
 
     def __len__(self) -> int:
         return int(self.rows.num_rows)
@@ -115,7 +119,7 @@ def format_parquet(features: FeatureTable, layer: str) -> bytes:
         "geometry_types": [features.geometry_type],
         "crs": pyproj.CRS.from_epsg(features.srid).to_json_dict(),
     }
-    if len(features):
+    if features.rows["geometry"].null_count < len(features):
         column["bbox"] = shapely.total_bounds(shapes).tolist()
     geo = {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": column}}
     out = BytesIO()
@@ -131,8 +135,14 @@ def format_geopackage(features: FeatureTable, layer: str) -> bytes:
 
 
 def format_flatgeobuf(features: FeatureTable, layer: str) -> bytes:
-    """The bytes of a FlatGeobuf with features in their order, hence without a spatial index."""
-    return _file_bytes(features, layer, "FlatGeobuf", "features.fgb", SPATIAL_INDEX="NO")
+    """The bytes of a FlatGeobuf with its spatial index.
+
+    The index dictates the order of features, and holds none without a geometry. So features that are
+    sorted, or some of which have no geometry, come without it.
+    """
+    is_indexed = not features.is_sorted and not features.rows["geometry"].null_count
+    options = {"SPATIAL_INDEX": "YES" if is_indexed else "NO"}
+    return _file_bytes(features, layer, "FlatGeobuf", "features.fgb", **options)
 
 
 def _file_bytes(features: FeatureTable, layer: str, driver: str, name: str, **options: str) -> bytes:

@@ -21,6 +21,10 @@ from tests.app.conftest import TEMPLATE, fresh_database
 from tests.factories import MadeBlock, make_block
 from tests.statements import run_sql
 
+COLLECTIONS = ("points", "blocks", "density", "point-history", "scenes")
+TAKEN = "2024-06-21T10:30:00.25Z"
+"""When two scenes of `store_with_unknowns` were taken and one of its points was tried last."""
+
 
 @dataclass(frozen=True)
 class Store:
@@ -66,6 +70,38 @@ def filled_store(cluster: Cluster, folder: Path) -> Iterator[Store]:
 def store(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     """One store for all tests of a module: they change nothing."""
     with filled_store(cluster, tmp_path_factory.mktemp("store")) as store:
+        yield store
+
+
+@pytest.fixture(scope="module")
+def store_with_unknowns(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
+    """The store of the abstract tests with unknown times of points and histories, and three scenes.
+
+    Of the 60 points three have no date, two no first and four no last one. A scene has an outline and a
+    time, one lies elsewhere, one has neither.
+    """
+    with filled_store(cluster, tmp_path_factory.mktemp("odd")) as store:
+        with engine.connect(store.dsn) as connection:
+            secret = create_token(connection, "registers", ["read", "register"]).secret
+        store.headers["Authorization"] = f"Bearer {secret}"
+        scenes = [
+            store.client.post(
+                f"/scenes?name={name}.tif", content=b"II*\0" + bytes(100), headers=store.headers
+            ).json()["id"]
+            for name in ("here", "away", "nowhere")
+        ]
+        with engine.connect(store.dsn) as connection:
+            for change in (
+                "update point set first_view = null, last_view = null where id % 64 < 3",
+                "update point set first_view = null where id % 64 between 3 and 4",
+                "update point set last_view = null where id % 64 between 5 and 8",
+                f"update point_history set last_attempt = '{TAKEN}' where point_id % 64 = 0",
+            ):
+                run_sql(connection, change)
+            outline = "ST_MakeEnvelope({0}, 43, {0} + 0.2, 43.2, 4326)"
+            for scene, west in ((scenes[0], 5), (scenes[1], 100)):
+                change = f"update scene set footprint = {outline.format(west)}, acquired_at = %s"
+                run_sql(connection, f"{change} where id = %s", (TAKEN, scene))
         yield store
 
 

@@ -8,48 +8,19 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from app.db import engine
-from app.usecases.tokens import create_token
-from tests.app.conformance.conftest import filled_store
-from tests.statements import run_sql
+from app.db.features.outlines import SCENES
+from app.db.features.predicates import BoxShape, box_predicate
+from app.db.points import POINTS
+from tests.app.conformance.conftest import COLLECTIONS, TAKEN
 
-COLLECTIONS = ("points", "blocks", "density", "point-history", "scenes")
 FIRST, LAST = "2023-03-01", "2023-06-09"
 """Dates of the views of most points."""
-TAKEN = "2024-06-21T10:30:00.25Z"
 INSTANT = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?Z")
 
 
 @pytest.fixture(scope="module")
-def store(cluster, tmp_path_factory):
-    """The store of the abstract tests with unknown times of points and histories, and three scenes.
-
-    Of the 60 points three have no date, two no first and four no last one. A scene has an outline and a
-    time, one lies elsewhere, one has neither.
-    """
-    with filled_store(cluster, tmp_path_factory.mktemp("odd")) as store:
-        with engine.connect(store.dsn) as connection:
-            secret = create_token(connection, "registers", ["read", "register"]).secret
-        store.headers["Authorization"] = f"Bearer {secret}"
-        scenes = [
-            store.client.post(
-                f"/scenes?name={name}.tif", content=b"II*\0" + bytes(100), headers=store.headers
-            ).json()["id"]
-            for name in ("here", "away", "nowhere")
-        ]
-        with engine.connect(store.dsn) as connection:
-            for change in (
-                "update point set first_view = null, last_view = null where id % 64 < 3",
-                "update point set first_view = null where id % 64 between 3 and 4",
-                "update point set last_view = null where id % 64 between 5 and 8",
-                f"update point_history set last_attempt = '{TAKEN}' where point_id % 64 = 0",
-            ):
-                run_sql(connection, change)
-            outline = "ST_MakeEnvelope({0}, 43, {0} + 0.2, 43.2, 4326)"
-            for scene, west in ((scenes[0], 5), (scenes[1], 100)):
-                change = f"update scene set footprint = {outline.format(west)}, acquired_at = %s"
-                run_sql(connection, f"{change} where id = %s", (TAKEN, scene))
-        yield store
+def store(store_with_unknowns):
+    return store_with_unknowns
 
 
 @pytest.fixture
@@ -105,11 +76,7 @@ def test_a_box_meets_scenes_inside_and_those_without_an_outline_and_intersects_o
     assert get("/search", datetime="1990-01-01T00:00:00Z/..").json()["numberMatched"] == 3
 
 
-def test_the_plan_of_a_box_of_points_does_not_ask_for_points_without_a_place(store):
-    from app.db.features.predicates import BoxShape, box_predicate
-    from app.db.points import POINTS
-    from app.usecases.features.items import SCENES
-
+def test_the_plan_of_a_box_of_points_does_not_ask_for_points_without_a_place():
     assert "IS NULL" not in str(box_predicate(POINTS, BoxShape(1, False)))
     assert "IS NULL" in str(box_predicate(SCENES, BoxShape(1, False)))
 
