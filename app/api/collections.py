@@ -64,6 +64,7 @@ def collections(
         except NotAllowed:
             continue
     links = _self_links(request, "collections")
+    links.append(Link(rel="root", href=str(request.base_url), type=JSON))
     if chosen_format(request, DOCUMENTS, f) == "json":
         with database.reading() as connection:
             listed = [describe(request, connection, *pair) for pair in readable]
@@ -105,7 +106,7 @@ def one_collection(
         columns=("property", "title", "type", "unit"),
         rows=[
             [Cell(item.name), Cell(item.title), Cell(item.type), Cell(item.unit)]
-            for item in collection.queryables.values()
+            for item in collection.columns.values()
         ],
         drawing=drawn([_rectangle(document.extent.spatial.bbox[0])]),
     )
@@ -135,7 +136,7 @@ def sortables(
     *, request: Request, collection: CollectionDep, viewer: ViewerDep, f: Format = None
 ) -> Response:
     """Return the properties that features can be sorted by, as a JSON Schema."""
-    members = {item.name: property_schema(item) for item in collection.queryables.values()}
+    members = {item.name: property_schema(item) for item in collection.columns.values()}
     return _schema_reply(request, collection, "sortables", members, f)
 
 
@@ -149,7 +150,7 @@ def schema(
 ) -> Response:
     """Return the properties of a feature and their roles, as a JSON Schema (Features - Part 5)."""
     members: dict[str, Any] = {}
-    for item in collection.queryables.values():
+    for item in collection.columns.values():
         members[item.name] = property_schema(item)
     members[collection.key.name]["x-ogc-role"] = "id"
     if collection.interval and collection.interval[0] != collection.interval[1]:
@@ -159,7 +160,7 @@ def schema(
         members[collection.interval[0]]["x-ogc-role"] = "primary-instant"
     members["geometry"] = {**geometry_schema(collection), "x-ogc-role": "primary-geometry"}
     # A property that is not required may be unknown: null in GeoJSON and in files, nothing in CSV.
-    required = [item.name for item in collection.queryables.values() if not item.nullable]
+    required = [item.name for item in collection.columns.values() if not item.nullable]
     required += [] if collection.geometry_nullable else ["geometry"]
     return _schema_reply(request, collection, "schema", members, f, required=required)
 

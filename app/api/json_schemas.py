@@ -70,7 +70,7 @@ def _properties_schema(collection: Collection) -> Schema:
     return {
         "type": "object",
         "description": f"Properties of a feature of the collection {collection.id}.",
-        "properties": {item.name: _nullable_schema(item) for item in collection.queryables.values()},
+        "properties": {item.name: _nullable_schema(item) for item in collection.columns.values()},
     }
 
 

@@ -14,6 +14,7 @@ JSON = "application/json"
 HTML = "text/html"
 SCHEMA_JSON = "application/schema+json"
 OPENAPI_JSON = "application/vnd.oai.openapi+json;version=3.1"
+OPENAPI_30_JSON = "application/vnd.oai.openapi+json;version=3.0"
 PROBLEM_JSON = "application/problem+json"
 TIFF = "image/tiff; application=geotiff"
 NPZ = "application/x-npz"
@@ -71,8 +72,6 @@ def chosen_format(request: Request, formats: Mapping[str, str], f: str | None) -
             raise InvalidParameter(f"f: {f!r:.40} found, one of {', '.join(formats)} expected")
         return f
     request.scope[NEGOTIATED] = True
-    by_type = {kind.split(";")[0]: name for name, kind in formats.items()}
-    by_type.setdefault(JSON, "json")
     accepted = []
     for rank, part in enumerate(request.headers.get("accept", "").split(",")):
         kind, *parameters = (word.strip().lower() for word in part.split(";"))
@@ -81,11 +80,19 @@ def chosen_format(request: Request, formats: Mapping[str, str], f: str | None) -
             weight = float(weights[0]) if weights else 1.0
         except ValueError:
             weight = 0.0
-        name = by_type.get(kind)
         versions = [word for word in parameters if word.startswith("version=")]
-        if name is not None and weight > 0.0 and all(word in formats[name] for word in versions):
+        name = _name_of(formats, kind, versions)
+        if name is not None and weight > 0.0:
             accepted.append((-weight, rank, name))
     return min(accepted)[2] if accepted else next(iter(formats))
+
+
+def _name_of(formats: Mapping[str, str], kind: str, versions: list[str]) -> str | None:
+    """The name of the format of a media type; plain JSON stands for the format that is named so."""
+    for name, offered in formats.items():
+        if offered.partition(";")[0] == kind and all(word in offered for word in versions):
+            return name
+    return "json" if kind == JSON else None
 
 
 def refuse_unknown(request: Request, parameters: set[str]) -> None:

@@ -1,6 +1,7 @@
 """The OpenAPI description: what FastAPI makes of the code, completed for clients of OGC API."""
 
 from collections.abc import Sequence
+from functools import cache
 from itertools import chain
 from typing import Any
 
@@ -14,6 +15,7 @@ from app.api.credentials import BASIC, BEARER
 from app.api.json_schemas import collection_schemas, property_schema, reference, schema_name
 from app.api.models.base import Link, Problem
 from app.api.negotiation import DOCUMENTS, FEATURES, GEOJSON, HTML, JSON, PROBLEM_JSON
+from app.api.openapi_30 import as_openapi_30
 from app.auth import Scope
 from app.config import Settings
 from app.db.features.collection import Collection, Property
@@ -54,6 +56,7 @@ def install(app: FastAPI, routers: Sequence[APIRouter], settings: Settings) -> N
         return app.openapi_schema
 
     app.openapi = openapi  # type: ignore[method-assign]
+    app.state.openapi_30 = cache(lambda: as_openapi_30(openapi()))
 
 
 def _declare_access(document: dict[str, Any], routers: Sequence[APIRouter], settings: Settings) -> None:

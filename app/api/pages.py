@@ -88,7 +88,7 @@ def features_page(
         page: title, description and links.
     """
     names = list(features[0]["properties"]) if features else []
-    absent = {name: item.absent for name, item in collection.queryables.items()}
+    absent = {name: item.absent for name, item in collection.columns.items()}
     here = f"{request.base_url}collections/{collection.id}/items"
     rows = [
         [

@@ -30,7 +30,8 @@ router = APIRouter(tags=["processes"], route_class=CallerRoute)
 VERSION = "1.0.0"
 OGC = "http://www.opengis.net/spec/ogcapi-processes-1/1.0/conf/"
 CONFORMS_TO = tuple(
-    f"{OGC}{name}" for name in ("core", "ogc-process-description", "json", "job-list", "dismiss")
+    f"{OGC}{name}"
+    for name in ("core", "ogc-process-description", "json", "oas30", "job-list", "dismiss")
 )
 EXECUTE = "http://www.opengis.net/def/rel/ogc/1.0/execute"
 QUALIFIED_VALUE = {"value", "mediaType", "encoding", "schema", "format"}

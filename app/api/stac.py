@@ -53,7 +53,7 @@ from app.db.features.outlines import SCENES
 from app.errors import InvalidParameter
 from app.usecases.features import items as all_features
 from app.usecases.features import stac
-from app.usecases.features.query import FeatureQuery, ResolvedQuery, Restriction, resolve
+from app.usecases.features.query import FeatureQuery, ResolvedQuery, Restriction, crs_of, resolve
 
 router = APIRouter(tags=["stac"], route_class=CallerRoute)
 
@@ -269,7 +269,7 @@ def items(
     query: Annotated[SceneItemsQuery, Query()],
 ) -> Response:
     """Return a page of scenes: STAC items, or features in another format."""
-    is_plain = query.crs is not None or query.properties is not None
+    is_plain = not _is_in_longitude_latitude(query.crs) or query.properties is not None
     if is_plain or chosen_format(request, FEATURES, query.f) != "json":
         return features.items(
             request=request,
@@ -300,7 +300,10 @@ def item(
     f: Format = None,
 ) -> Response:
     """Return a scene: a STAC item, or a feature in another reference system or as a page."""
-    if crs is not None or chosen_format(request, {"json": GEOJSON, "html": HTML}, f) != "json":
+    if (
+        not _is_in_longitude_latitude(crs)
+        or chosen_format(request, {"json": GEOJSON, "html": HTML}, f) != "json"
+    ):
         return features.item(
             feature_id=item_id,
             request=request,
@@ -316,6 +319,11 @@ def item(
         items = stac.stac_items(connection, text.encode(), str(request.base_url))
     headers = {"Content-Crs": f"<{reply_crs.uri}>"}
     return GeoJsonResponse(items[0], headers=headers)
+
+
+def _is_in_longitude_latitude(crs: str | None) -> bool:
+    """Whether a reply in a reference system can be STAC, which knows this one alone."""
+    return crs is None or crs_of("crs", crs, SCENES) is SCENES.storage_crs
 
 
 def _resolved(

@@ -14,6 +14,7 @@ from app.api.negotiation import (
     DOCUMENTS,
     HTML,
     JSON,
+    OPENAPI_30_JSON,
     OPENAPI_JSON,
     chosen_format,
     described,
@@ -33,8 +34,8 @@ FEATURES = "http://www.opengis.net/spec/ogcapi-features-"
 CQL2 = "http://www.opengis.net/spec/cql2/1.0/conf/"
 TILES = "http://www.opengis.net/spec/ogcapi-tiles-1/1.0/conf/"
 CONFORMS_TO = (
-    *(f"{COMMON}{name}" for name in ("core", "landing-page", "json", "html")),
-    *(f"{FEATURES}1/1.0/conf/{name}" for name in ("core", "geojson", "html")),
+    *(f"{COMMON}{name}" for name in ("core", "landing-page", "json", "html", "oas30")),
+    *(f"{FEATURES}1/1.0/conf/{name}" for name in ("core", "geojson", "html", "oas30")),
     f"{FEATURES}2/1.0/conf/crs",
     *(
         f"{FEATURES}3/1.0/conf/{name}"
@@ -60,11 +61,14 @@ CONFORMS_TO = (
     *processes.CONFORMS_TO,
     *stac.CONFORMS_TO,
 )
+DESCRIPTIONS = {"json": OPENAPI_JSON, "oas30": OPENAPI_30_JSON, "plain": JSON, "html": HTML}
+"""Formats of the description; clients that know neither version of OpenAPI take plain JSON."""
 REL = "http://www.opengis.net/def/rel/ogc/1.0/"
 LINKS = (
     ("self", "", JSON, "this document"),
     ("alternate", "?f=html", HTML, "this document as a page"),
-    ("service-desc", "api", OPENAPI_JSON, "description of the API in OpenAPI"),
+    ("service-desc", "api", OPENAPI_JSON, "description of the API in OpenAPI 3.1"),
+    ("service-desc", "api?f=oas30", OPENAPI_30_JSON, "description of the API in OpenAPI 3.0"),
     ("service-doc", "api?f=html", HTML, "description of the API as a page"),
     ("conformance", "conformance", JSON, "conformance classes of the service"),
     (f"{REL}conformance", "conformance", JSON, "conformance classes of the service"),
@@ -120,15 +124,15 @@ def conformance(*, request: Request, f: Format = None) -> Response:
 
 @router.get("/api", include_in_schema=False)
 def description(*, request: Request, f: Format = None) -> Response:
-    """Return the description of the API in OpenAPI 3.1, or a page of its operations."""
+    """Return the description of the API in OpenAPI 3.1 or 3.0, or a page of its operations."""
     refuse_unknown(request, {"f"})
-    server = {"url": str(request.base_url).rstrip("/")}
-    document: dict[str, Any] = request.app.openapi() | {"servers": [server]}
-    form = chosen_format(request, {"json": OPENAPI_JSON, "plain": JSON, "html": HTML}, f)
-    if form != "html":
-        # GDAL refuses the media type of OpenAPI 3.1; its Accept header also allows plain JSON.
-        return JSONResponse(document, media_type=OPENAPI_JSON if form == "json" else JSON)
-    return operations_page(request, document)
+    form = chosen_format(request, DESCRIPTIONS, f)
+    if form == "html":
+        return operations_page(request, request.app.openapi())
+    app = request.app
+    document: dict[str, Any] = app.state.openapi_30() if form == "oas30" else app.openapi()
+    servers = [{"url": str(request.base_url).rstrip("/")}]
+    return JSONResponse({**document, "servers": servers}, media_type=DESCRIPTIONS[form])
 
 
 @router.get("/healthz", dependencies=[Public])

@@ -137,6 +137,7 @@ class Collection:
         total: SELECT of the number of visible rows, where that is faster than counting.
         estimate_in_box: about how many features a box contains for anybody, where cells are counted.
         is_open: whether everybody may list it where points are public.
+        members: of a feature, beside its properties, that a filter may name.
     """
 
     id: str
@@ -155,6 +156,7 @@ class Collection:
     total: Select[Any] | None = None
     estimate_in_box: Callable[[Connection, Box], int] | None = None
     is_open: bool = True
+    members: tuple[Property, ...] = ()
 
     @property
     def crs(self) -> tuple[Crs, ...]:
@@ -172,6 +174,11 @@ class Collection:
         return CRS84H if self.has_height else CRS84
 
     @cached_property
-    def queryables(self) -> dict[str, Property]:
-        """The properties that a filter may name, by name; the geometry comes beside them."""
+    def columns(self) -> dict[str, Property]:
+        """The key and the properties by name: what files have and features are sorted by."""
         return {item.name: item for item in (self.key, *self.properties)}
+
+    @cached_property
+    def queryables(self) -> dict[str, Property]:
+        """What a filter may name, by name; the geometry comes beside it."""
+        return self.columns | {item.name: item for item in self.members}

@@ -148,7 +148,7 @@ def period(
 ) -> tuple[datetime | None, datetime | None]:
     """The first and the last time of all that the viewer may see; None without any."""
     assert collection.interval is not None
-    start, end = (collection.queryables[name].expression for name in collection.interval)
+    start, end = (collection.columns[name].expression for name in collection.interval)
     statement = select_visible(collection, None, func.min(start), func.max(end))
     rows: list[Any] = list(connection.execute(statement, viewer.parameters))
     return rows[0][0], rows[0][1]

@@ -130,4 +130,5 @@ SCENES = Collection(
     visible=or_(IS_ADMIN, scene.c.owner == VIEWER),
     interval=("datetime", "datetime"),
     is_open=False,
+    members=(Property("collection", "Identifier of the collection", text_constant("scenes")),),
 )

@@ -137,7 +137,7 @@ def in_time(collection: Collection, since: Moment | None, until: Moment | None) 
     """
     if collection.interval is None:
         return ANYTHING
-    start, end = (collection.queryables[name] for name in collection.interval)
+    start, end = (collection.columns[name] for name in collection.interval)
     parts = []
     if until is not None:
         parts.append(_or_unknown(start, Time.of(start) <= Time.of(until)))

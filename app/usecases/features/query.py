@@ -318,7 +318,7 @@ def _properties(collection: Collection, text: str | None) -> tuple[Property, ...
         return collection.properties
     names = [name for name in text.split(",") if name]
     for name in names:
-        if name not in collection.queryables:
+        if name not in collection.columns:
             raise _unknown_property("properties", name, collection)
     return tuple(item for item in collection.properties if item.name in names)
 
@@ -327,17 +327,17 @@ def _order(collection: Collection, text: str | None) -> tuple[Order, ...]:
     orders = []
     for part in [] if text is None else text.split(","):
         name = part.strip().lstrip("+-")
-        item = collection.queryables.get(name)
+        item = collection.columns.get(name)
         if item is None:
             raise _unknown_property("sortby", name, collection)
         orders.append(Order(item, part.strip().startswith("-")))
-    if len(orders) > len(collection.queryables):
+    if len(orders) > len(collection.columns):
         raise InvalidParameter("sortby: more properties than there are")
     return tuple(orders)
 
 
 def _unknown_property(parameter: str, name: str, collection: Collection) -> InvalidParameter:
-    names = ", ".join(collection.queryables)
+    names = ", ".join(collection.columns)
     return InvalidParameter(
         f"{parameter}: no property {name!r:.60} in {collection.id}: there are {names}"
     )
