@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, ConfigDict, Field
 
 from app.api.deps import ChipsDep, DatabaseDep, PointsReader
 from app.api.features import parameter_names
-from app.api.negotiation import NPZ, TIFF, refuse_unknown
+from app.api.negotiation import FILE_HEADER, NPZ, TIFF, refuse_unknown
 from app.api.routes import CallerRoute
 from app.errors import DamagedFile, InvalidParameter
 from app.storage import StoredChips
@@ -32,6 +32,7 @@ ARCHIVE: dict[int | str, dict[str, Any]] = {
         " `sun_azimuth_deg`. tif: a GeoTIFF with a page for each chip and the same values in its JSON"
         " description. Points are in the order of their ids; the chips of a point are contiguous.",
         "content": {NPZ: {}, TIFF: {}},
+        "headers": FILE_HEADER,
     }
 }
 

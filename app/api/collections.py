@@ -64,7 +64,7 @@ def collections(
         except NotAllowed:
             continue
     links = _self_links(request, "collections")
-    links.append(Link(rel="root", href=str(request.base_url), type=JSON))
+    links.append(Link(rel="root", href=str(request.base_url), type=JSON, title="the service"))
     if chosen_format(request, DOCUMENTS, f) == "json":
         with database.reading() as connection:
             listed = [describe(request, connection, *pair) for pair in readable]
@@ -202,16 +202,16 @@ def _collection_links(request: Request, collection: Collection) -> list[Link]:
             for name, media_type in FEATURES.items()
             if name != "json"
         ),
-        Link(rel="root", href=base, type=JSON),
-        Link(rel="parent", href=base, type=JSON),
-        Link(rel="describedby", href=f"{here}/schema", type=SCHEMA_JSON),
+        Link(rel="root", href=base, type=JSON, title="the service"),
+        Link(rel="parent", href=base, type=JSON, title="the service"),
+        Link(rel="describedby", href=f"{here}/schema", type=SCHEMA_JSON, title="schema"),
         *(
-            Link(rel=f"{REL}/{name}", href=f"{here}/{name}", type=SCHEMA_JSON)
+            Link(rel=f"{REL}/{name}", href=f"{here}/{name}", type=SCHEMA_JSON, title=name)
             for name in ("schema", "queryables", "sortables")
         ),
     ]
     if collection.id in TILED:
-        links.append(Link(rel=f"{REL}/tilesets-vector", href=f"{here}/tiles", type=JSON))
+        links.append(Link(rel=f"{REL}/tilesets-vector", href=f"{here}/tiles", type=JSON, title="tiles"))
     return links
 
 

@@ -11,7 +11,17 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from app.api.access import needs
 from app.api.deps import CallerDep, DatabaseDep, SecretDep, SettingsDep
-from app.api.negotiation import FEATURES, GEOJSON, HTML, JSON, chosen_format, refuse_unknown
+from app.api.negotiation import (
+    CRS_HEADER,
+    FEATURES,
+    FILE_HEADER,
+    GEOJSON,
+    HTML,
+    JSON,
+    chosen_format,
+    header,
+    refuse_unknown,
+)
 from app.api.pages import Page, count_text, features_page
 from app.api.routes import CallerRoute
 from app.api.streams import Streamed
@@ -91,7 +101,17 @@ def parameter_names(model: type[BaseModel]) -> set[str]:
 
 ITEMS_PARAMETERS = parameter_names(ItemsQuery)
 CONTENT: dict[str, Any] = {media_type: {} for media_type in FEATURES.values()}
-PAGE: dict[int | str, dict[str, Any]] = {200: {"description": "A page.", "content": CONTENT}}
+PAGE_HEADERS = {
+    **CRS_HEADER,
+    **FILE_HEADER,
+    "OGC-NumberMatched": header("Number of features on all pages."),
+    "OGC-NumberReturned": header("Number of features on this page."),
+    "Amers-Next-Token": header("The parameter `token` of the next page; none on the last one."),
+    "Link": header("Links to this page and the next one."),
+}
+PAGE: dict[int | str, dict[str, Any]] = {
+    200: {"description": "A page.", "content": CONTENT, "headers": PAGE_HEADERS}
+}
 
 
 def equal_parameters(request: Request, collection: Collection) -> tuple[tuple[str, str], ...]:
@@ -160,7 +180,9 @@ def search(
 @router.get(
     "/collections/{collection}/items/{feature_id}",
     response_class=Response,
-    responses={200: {"description": "A feature.", "content": {GEOJSON: {}, HTML: {}}}},
+    responses={
+        200: {"description": "A feature.", "content": {GEOJSON: {}, HTML: {}}, "headers": CRS_HEADER}
+    },
 )
 def item(
     *,

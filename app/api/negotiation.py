@@ -51,10 +51,24 @@ def json_reply(document: Reply, media_type: str = JSON) -> Response:
     return Response(document.model_dump_json(by_alias=True), media_type=media_type)
 
 
-def described(model: type[Reply], *others: str) -> dict[int | str, dict[str, Any]]:
-    """The description of a reply that an endpoint makes itself: its model, and its other media types."""
+def described(
+    model: type[Reply], *others: str, headers: Mapping[str, Any] | None = None
+) -> dict[int | str, dict[str, Any]]:
+    """The description of a reply that an endpoint makes itself: its model, media types, headers."""
     text = (model.__doc__ or model.__name__).partition("\n")[0]
-    return {200: {"description": text, "model": model, "content": {other: {} for other in others}}}
+    content: dict[str, Any] = {other: {} for other in others}
+    ok = {"description": text, "model": model, "content": content}
+    return {200: ok | ({"headers": headers} if headers else {})}
+
+
+def header(description: str) -> dict[str, Any]:
+    """The description of a header of a reply."""
+    return {"description": description, "schema": {"type": "string"}}
+
+
+CRS_HEADER = {"Content-Crs": header("URI of the coordinate reference system of the reply.")}
+TAG_HEADER = {"ETag": header("Tag of the content, for `If-None-Match`.")}
+FILE_HEADER = {"Content-Disposition": header("Name of the file, for formats that are files.")}
 
 
 def chosen_format(request: Request, formats: Mapping[str, str], f: str | None) -> str:

@@ -20,7 +20,7 @@ from app.auth import Scope
 from app.config import Settings
 from app.db.features.collection import Collection, Property
 from app.usecases.features.items import COLLECTIONS
-from app.usecases.features.tiles import MATRIX_SET, MOST_ZOOM
+from app.usecases.features.tiles import MATRIX_SET, MOST_ZOOM, TILED
 
 REFUSED = {
     "description": "The request cannot be served; problem details say why.",
@@ -125,7 +125,8 @@ def _kinds(schema: dict[str, Any]) -> list[dict[str, Any]]:
 def _expand_collections(paths: dict[str, Any], path: str) -> None:
     """Replace a path of any collection by one for each: clients read limits and properties there."""
     operations = paths.pop(path)
-    for name, collection in COLLECTIONS.items():
+    has_path = TILED if "/tiles" in path else COLLECTIONS
+    for name, collection in ((name, COLLECTIONS[name]) for name in has_path):
         own_path = path.replace("{collection}", name)
         if own_path not in paths:
             paths[own_path] = {

@@ -11,6 +11,8 @@ from app.api.deps import ChipsDep, DatabaseDep, PointsReader
 from app.api.features import CrsUri, Format
 from app.api.models.features import PointWithViews
 from app.api.negotiation import (
+    CRS_HEADER,
+    FILE_HEADER,
     GEOJSON,
     HTML,
     JSON,
@@ -55,7 +57,11 @@ NOT_PROPERTIES = {
 }
 
 
-@router.get("/{point_id}", response_class=GeoJsonResponse, responses=described(PointWithViews, HTML))
+@router.get(
+    "/{point_id}",
+    response_class=GeoJsonResponse,
+    responses=described(PointWithViews, HTML, headers=CRS_HEADER),
+)
 def item(
     *,
     point_id: PathNumber,
@@ -83,7 +89,9 @@ def item(
 @router.get(
     "/{point_id}/chips",
     response_class=Response,
-    responses={200: {"description": "The chips.", "content": {NPZ: {}, PNG: {}}}},
+    responses={
+        200: {"description": "The chips.", "content": {NPZ: {}, PNG: {}}, "headers": FILE_HEADER}
+    },
 )
 def chips(
     *,
@@ -107,7 +115,9 @@ def chips(
 @router.get(
     "/{point_id}/chips/{view}",
     response_class=Response,
-    responses={200: {"description": "A chip.", "content": {PNG: {}, TIFF: {}, NPZ: {}}}},
+    responses={
+        200: {"description": "A chip.", "content": {PNG: {}, TIFF: {}, NPZ: {}}, "headers": FILE_HEADER}
+    },
 )
 def chip(
     *,

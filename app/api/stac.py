@@ -33,6 +33,7 @@ from app.api.features import (
 from app.api.models.base import Link
 from app.api.models.features import StacItem, StacItems
 from app.api.negotiation import (
+    CRS_HEADER,
     FEATURES,
     GEOJSON,
     HTML,
@@ -81,7 +82,7 @@ COLLECTION_MEMBERS: dict[str, Any] = {
     "stac_version": stac.VERSION,
     "license": "other",
 }
-ITEMS = described(StacItems)
+ITEMS = described(StacItems, headers=CRS_HEADER)
 
 
 def landing_links(base: str) -> list[Link]:
@@ -288,7 +289,7 @@ def items(
 @router.get(
     "/collections/scenes/items/{item_id}",
     response_class=GeoJsonResponse,
-    responses=described(StacItem, HTML),
+    responses=described(StacItem, HTML, headers=CRS_HEADER),
 )
 def item(
     *,

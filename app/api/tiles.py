@@ -18,7 +18,7 @@ from app.api.models.documents import (
     TileSet,
     TileSets,
 )
-from app.api.negotiation import JSON, MVT
+from app.api.negotiation import JSON, MVT, TAG_HEADER
 from app.api.paths import PathNumber
 from app.api.routes import CallerRoute
 from app.db.features.collection import Collection
@@ -97,7 +97,10 @@ def tileset(
 @router.get(
     "/collections/{collection}/tiles/{matrix_set}/{z}/{y}/{x}",
     response_class=Response,
-    responses={200: {"description": "A vector tile.", "content": {MVT: {}}}},
+    responses={
+        200: {"description": "A vector tile.", "content": {MVT: {}}, "headers": TAG_HEADER},
+        304: {"description": "The tile that the caller has is the newest.", "headers": TAG_HEADER},
+    },
 )
 def tile(
     *,
