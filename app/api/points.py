@@ -17,6 +17,7 @@ from app.api.negotiation import (
     HTML,
     JSON,
     NPZ,
+    TAG_HEADER,
     TIFF,
     GeoJsonResponse,
     chosen_format,
@@ -90,7 +91,11 @@ def item(
     "/{point_id}/chips",
     response_class=Response,
     responses={
-        200: {"description": "The chips.", "content": {NPZ: {}, PNG: {}}, "headers": FILE_HEADER}
+        200: {
+            "description": "The chips.",
+            "content": {NPZ: {}, PNG: {}},
+            "headers": FILE_HEADER | TAG_HEADER,
+        }
     },
 )
 def chips(
@@ -116,7 +121,11 @@ def chips(
     "/{point_id}/chips/{view}",
     response_class=Response,
     responses={
-        200: {"description": "A chip.", "content": {PNG: {}, TIFF: {}, NPZ: {}}, "headers": FILE_HEADER}
+        200: {
+            "description": "A chip.",
+            "content": {PNG: {}, TIFF: {}, NPZ: {}},
+            "headers": FILE_HEADER | TAG_HEADER,
+        }
     },
 )
 def chip(
