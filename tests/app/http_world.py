@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from uuid import UUID
 
+import httpx
 from fastapi import FastAPI
 from fastapi.routing import iter_route_contexts
 from fastapi.testclient import TestClient
@@ -24,6 +25,8 @@ from tests.factories import BOX, make_block
 SITE = "https://viewer.example"
 """A site whose pages may call the service."""
 TIFF = b"II*\0" + bytes(range(250)) * 40
+FORMATS = ("json", "html", "csv", "fgb", "parquet", "gpkg")
+PER_REQUEST = {"date", "x-request-id"}
 TUS = {"Tus-Resumable": "1.0.0"}
 
 
@@ -34,7 +37,7 @@ class Route:
     Attributes:
         path: with its parameters in braces.
         methods: of this path in all routes.
-        numbers: names of the path parameters that are numbers.
+        names: of its parameters.
     """
 
     path: str
@@ -72,6 +75,18 @@ class HttpWorld:
         if route.path.startswith("/scenes/"):
             values = {"name": "a.tif"} | other | {k: v for k, v in values.items() if k != "name"}
         return re.sub(r"{(\w+)(:\w+)?}", lambda found: values[found[1]], route.path)
+
+    def files(self) -> list[str]:
+        """Addresses of stored files: a scene image and a result."""
+        return [
+            f"/scenes/{self.values['scene_id']}/files/a.tif",
+            f"/jobs/{self.values['job_id']}/results/block.zip",
+        ]
+
+
+def headers_of(reply: httpx.Response) -> dict[str, str]:
+    """The headers of a reply that are not of this request alone."""
+    return {name: value for name, value in reply.headers.items() if name not in PER_REQUEST}
 
 
 @contextmanager
