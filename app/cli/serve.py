@@ -28,6 +28,8 @@ BACKLOG = 2048
 API_ENDING_S = 45.0
 """Time to complete requests under way (30 s) and to close what the API has opened."""
 WATCH_S = 2.0
+WATCH_ENDING_S = 10.0
+"""The watcher may be starting the database again; the end does not wait for it longer."""
 
 log = logging.getLogger(__name__)
 
@@ -116,4 +118,4 @@ def database_watched(settings: Settings) -> Iterator[None]:
         yield
     finally:
         stop.set()
-        watcher.join()
+        watcher.join(WATCH_ENDING_S)

@@ -91,7 +91,9 @@ class Client:
         query: dict[str, Any] | None = {"f": "json", "limit": PAGE} | {
             name: value for name, value in conditions.items() if value is not None
         }
+        asked: set[str] = set()
         while query is not None:
+            _ask_once(asked, repr(query))
             page = self._connection.request(
                 "POST", f"collections/{collection}/search", json=query
             ).json()
@@ -105,8 +107,9 @@ class Client:
 
     def csv(self, collection: str, bbox: Box | None = None) -> Iterator[bytes]:
         """The features of a collection as one CSV with a header, in pieces."""
-        token, is_first = None, True
+        token, is_first, asked = None, True, set[str]()
         while is_first or token is not None:
+            _ask_once(asked, str(token))
             page = self._page(collection, "csv", bbox, PAGE, token)
             header, _, rows = page.content.partition(b"\r\n")
             yield header + b"\r\n" + rows if is_first else rows
@@ -223,3 +226,14 @@ class Client:
         target.parent.mkdir(parents=True, exist_ok=True)
         self._connection.download(f"jobs/{job.id}/results/{quote(name)}", target)
         return target
+
+
+def _ask_once(asked: set[str], page: str) -> None:
+    """Note a page of a collection.
+
+    Raises:
+        ServiceFailure: it was read before: links to the next page form a ring.
+    """
+    if page in asked:
+        raise ServiceFailure("the service names a next page that was already read")
+    asked.add(page)

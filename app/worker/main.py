@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -31,6 +32,8 @@ PAUSE_S = 2.0
 """Pause before the queue is read again after an outage of the database."""
 STORAGE_RETRY_S = 60.0
 """Pause before a worker without jobs looks again whether the storage belongs to the database."""
+ENDING_S = 60.0
+"""A worker that is still there so long after its signal ends at once, whatever its threads wait for."""
 
 log = logging.getLogger(__name__)
 
@@ -44,6 +47,7 @@ def run_worker(settings: Settings) -> None:
     stop = threading.Event()
     for number in ENDING:
         signal.signal(number, lambda *_: stop.set())
+    threading.Thread(target=_end_at_last, args=(stop, ENDING_S), name="ending", daemon=True).start()
     storage = open_storage(settings)
     with (
         engine.opened(settings) as database,
@@ -65,6 +69,17 @@ def _installation(settings: Settings, database: Database) -> dict[str, str]:
         "AMERS_DATA_FOLDER": str(settings.data_folder),
         **({} if ingest is None else {"AMERS_INGEST_FOLDER": str(ingest)}),
     }
+
+
+def _end_at_last(stop: threading.Event, seconds: float) -> None:
+    """End this process some time after its signal: a silent disk or server may hold its threads.
+
+    The lease of its job expires, and another worker takes the job over.
+    """
+    stop.wait()
+    time.sleep(seconds)
+    log.error("this worker has not ended within %g s of its signal and is ended", seconds)
+    os._exit(1)
 
 
 @contextmanager

@@ -110,6 +110,8 @@ def _upload(service: Service, image: Path, sigma_m: float | None, progress: Prog
         while not is_complete:
             try:
                 offset = int(service.head(place, TUS)["upload-offset"])
+                if offset < arrived:
+                    raise ServiceError(f"the service has lost a part of {image.name} that it had")
                 if offset > arrived:
                     arrived, breaks = offset, 0
                 file.seek(offset)

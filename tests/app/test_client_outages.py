@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import islice
 from threading import Thread
 
 import pytest
@@ -21,6 +22,20 @@ long_enough_s = 60.0
 def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
     """Polls follow each other at once."""
     monkeypatch.setattr(client_module, "POLL_S", 0.0)
+
+
+@contextmanager
+def serving(replies: type[BaseHTTPRequestHandler]) -> Iterator[str]:
+    """The address of a server of these replies."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), replies)
+    thread = Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
 
 
 @contextmanager
@@ -45,16 +60,8 @@ def service(*statuses: int) -> Iterator[Client]:
 
         log_message: Callable[..., None] = lambda *_: None
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Replies)
-    thread = Thread(target=server.serve_forever)
-    thread.start()
-    try:
-        with Client(f"http://127.0.0.1:{server.server_port}") as client:
-            yield client
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
+    with serving(Replies) as url, Client(url) as client:
+        yield client
     assert left == []
 
 
@@ -73,3 +80,31 @@ def test_an_outage_that_lasts_ends_the_waiting(monkeypatch):
     monkeypatch.setattr(client_module, "OUTAGE_S", 0.0)
     with service(503) as client, pytest.raises(ServiceFailure, match="not now"):
         client.wait(RUNNING, timeout_s=long_enough_s)
+
+
+@pytest.mark.parametrize("form", ["features", "csv"])
+def test_pages_whose_links_form_a_ring_end_with_a_sentence(form: str):
+    """A server that repeats a token would be read for ever."""
+
+    class Ring(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            self.rfile.read(int(self.headers["Content-Length"]))
+            links = [{"rel": "next", "body": {"token": "again"}}]
+            self.reply(json.dumps({"features": [{}], "links": links}).encode())
+
+        def do_GET(self) -> None:
+            self.reply(b"id\r\n1\r\n")
+
+        def reply(self, body: bytes) -> None:
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(body)))
+            self.send_header(client_module.NEXT_TOKEN, "again")
+            self.end_headers()
+            self.wfile.write(body)
+
+        log_message: Callable[..., None] = lambda *_: None
+
+    with serving(Ring) as url, Client(url) as client:
+        pages = client.csv("points") if form == "csv" else client.features("points")
+        with pytest.raises(ServiceFailure, match="already read"):
+            list(islice(pages, 10))

@@ -1,5 +1,6 @@
 """The private cluster: shared, started and stopped on demand, and robust against killed processes."""
 
+import fcntl
 import os
 import shutil
 import signal
@@ -278,3 +279,17 @@ def test_a_server_that_was_killed_is_revived_for_those_who_still_hold_a_lease(ow
         with psycopg.connect(dsn) as connection:
             assert connection.execute("select 1").fetchone() == (1,)
     assert has_stopped(own)
+
+
+def test_a_command_that_holds_the_turn_for_ever_is_not_waited_for(
+    open_folder: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(embedded, "TURN_SECONDS", 0.1)
+    folder = open_folder / uuid4().hex
+    folder.mkdir(mode=0o700)
+    user = server_user(folder)
+    os.chown(folder, user.uid, user.gid)
+    with (folder / "turn").open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with pytest.raises(InputError, match="another command"):
+            Cluster(folder).revive()

@@ -239,6 +239,14 @@ def test_a_file_system_without_locks_is_used_without_them(
     assert run_in(tmp_path / "out") == "new"
 
 
+def test_a_file_system_that_numbers_a_file_anew_each_time_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(os.path, "samestat", lambda one, other: False)
+    with pytest.raises(InputError, match="another number each time"):
+        write_result(tmp_path / "out", "new")
+
+
 def test_folders_that_cannot_be_replaced_are_refused_with_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

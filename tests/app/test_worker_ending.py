@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from app.config import Settings
 from tests.app.worker_processes import wait_until
 
@@ -36,8 +38,26 @@ run_worker(read_settings())
 """A worker whose queue has a leftover task that ignores its cancellation."""
 
 
-def test_a_worker_ends_although_a_task_of_its_queue_ignores_its_cancellation(
-    settings: Settings, tmp_path: Path
+STUCK = """
+import sys, threading
+import app.worker.main as main
+from app.config import read_settings
+from app.worker.sweep import Sweeper
+
+def sweep(self):
+    print("waits", flush=True)
+    threading.Event().wait()
+
+main.ENDING_S = 0.5
+Sweeper.run = sweep
+main.run_worker(read_settings())
+"""
+"""A worker whose sweeper waits for a disk that never answers."""
+
+
+@pytest.mark.parametrize(("program", "code"), [(STUBBORN, 0), (STUCK, 1)])
+def test_a_worker_ends_although_a_task_ignores_its_cancellation_or_a_thread_never_ends(
+    settings: Settings, tmp_path: Path, program: str, code: int
 ) -> None:
     assert settings.database_url is not None
     environment = os.environ | {
@@ -46,11 +66,11 @@ def test_a_worker_ends_although_a_task_of_its_queue_ignores_its_cancellation(
     }
     told = tmp_path / "told"
     with told.open("wb") as output:
-        worker = subprocess.Popen([sys.executable, "-c", STUBBORN], env=environment, stdout=output)
+        worker = subprocess.Popen([sys.executable, "-c", program], env=environment, stdout=output)
     try:
         wait_until(lambda: "waits" in told.read_text(), "the worker waits for jobs")
         worker.send_signal(signal.SIGTERM)
-        assert worker.wait(timeout=PATIENCE_S) == 0
+        assert worker.wait(timeout=PATIENCE_S) == code
     finally:
         worker.kill()
         worker.wait()

@@ -41,6 +41,8 @@ SOCKET_NAME = ".s.PGSQL.5432"
 LONGEST_SOCKET_PATH = 107
 START_SECONDS, STOP_SECONDS = 120.0, 60.0
 LEAVING_SECONDS = 10.0
+TURN_SECONDS = 2 * START_SECONDS + 2 * STOP_SECONDS
+"""Longest wait for another command that starts or stops the server, which has limits of its own."""
 LOCK_SECONDS = 20.0
 
 CONFIGURATION = """\
@@ -205,10 +207,23 @@ class Cluster:
     def _turn(self) -> Iterator[None]:
         turn = os.open(self.folder / "turn", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
-            fcntl.flock(turn, fcntl.LOCK_EX)
+            self._wait_for_turn(turn)
             yield
         finally:
             os.close(turn)
+
+    def _wait_for_turn(self, turn: int) -> None:
+        deadline = time.monotonic() + TURN_SECONDS
+        while True:
+            try:
+                return fcntl.flock(turn, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    raise InputError(
+                        f"another command has been starting or stopping PostgreSQL in {self.folder} for "
+                        f"{TURN_SECONDS:g} s: end that command"
+                    ) from None
+            time.sleep(0.01)
 
     def _make_folder(self, user: ServerUser) -> None:
         try:

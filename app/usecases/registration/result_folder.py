@@ -35,6 +35,8 @@ _NEW, _OLD = "new", "old"
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
 _CANNOT_EXCHANGE = (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP)
+_MOST_LOCKS = 100
+"""Times that the lock of a folder is taken anew, because another command has replaced it meanwhile."""
 _CANNOT_LOCK = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
@@ -148,7 +150,7 @@ def _locked(folder: Path, work: Path) -> int:
     Raises:
         InputError: another process works in it, or it was not made by Amers.
     """
-    while True:
+    for _ in range(_MOST_LOCKS):
         work.mkdir(parents=True, exist_ok=True)
         if not (work / _LOCK).exists() and any(work.iterdir()):
             raise InputError(f"{work}: holds files that Amers did not write; move this folder away")
@@ -172,6 +174,10 @@ def _locked(folder: Path, work: Path) -> int:
             if os.path.samestat(os.fstat(lock), (work / _LOCK).stat()):
                 return lock
         os.close(lock)
+    raise InputError(
+        f"{work}: its lock cannot be kept: other commands replace the folder again and again, or its "
+        "file system gives a file another number each time; name a folder on another one with -o"
+    )
 
 
 def _recover(place: Path, work: Path) -> None:
