@@ -176,14 +176,14 @@ class _Node:
         text = self.text(name)
         try:
             time = datetime.fromisoformat(text)
-        except ValueError:
-            time = None
-        if time is None or time.tzinfo is None:
-            raise FormatError(
-                f"{BLOCK_JSON}: {self._name(name)}: {text!r} found, "
-                "an ISO 8601 time with a time zone expected"
-            )
-        return time.astimezone(UTC)
+            if time.tzinfo is not None:
+                return time.astimezone(UTC)
+        except (ValueError, OverflowError):
+            pass
+        raise FormatError(
+            f"{BLOCK_JSON}: {self._name(name)}: {text!r} found,"
+            " an ISO 8601 time with a time zone expected"
+        )
 
 
 def _parse_metadata(root: _Node) -> BlockMetadata:

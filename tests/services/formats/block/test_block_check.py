@@ -257,6 +257,7 @@ def test_a_table_with_column_names_that_are_not_text_is_refused(block, table):
         (["amers:version"], None),
         (["amers:created"], "yesterday"),
         (["amers:created"], "2024-05-06T07:08:09"),
+        (["amers:created"], "0001-01-01T00:00:00+14:00"),
         (["amers:counts", "points"], "40"),
         (["amers:counts", "points"], True),
         (["amers:specification", "chip_size"], 51),
