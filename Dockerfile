@@ -1,6 +1,11 @@
 # One image for the API with its map page and for the worker. It has no PostgreSQL server for a private
 # cluster, so it needs AMERS_DATABASE_URL: see docker-compose.yml.
-FROM node:22-bookworm-slim AS page
+#
+# Bases by tag, as they are updated. `scripts/pin-images` prints them with their digests of this moment.
+ARG NODE_IMAGE=node:22-bookworm-slim
+ARG PYTHON_IMAGE=python:3.12-slim-bookworm
+
+FROM ${NODE_IMAGE} AS page
 
 WORKDIR /build/web
 COPY web/package.json web/package-lock.json ./
@@ -8,19 +13,21 @@ RUN --mount=type=cache,target=/root/.npm npm ci --ignore-scripts --no-audit --no
 COPY web ./
 RUN npm run check && npm run build
 
-FROM python:3.12-slim-bookworm AS build
+FROM ${PYTHON_IMAGE} AS build
 
 WORKDIR /build
 RUN python -m venv /opt/amers
-COPY constraints.txt ./
+# Only files with a known hash; scripts/make-requirements wrote them down.
+COPY requirements.txt ./
+RUN --mount=type=cache,target=/root/.cache/pip /opt/amers/bin/pip install --require-hashes -r requirements.txt
 COPY pyproject.toml README.md LICENSE ./
 COPY app app
 COPY migrations migrations
 COPY services services
 COPY --from=page /build/app/web/built app/web/built
-RUN --mount=type=cache,target=/root/.cache/pip /opt/amers/bin/pip install -c constraints.txt .
+RUN /opt/amers/bin/pip install --no-index --no-deps --no-build-isolation . && /opt/amers/bin/pip check
 
-FROM python:3.12-slim-bookworm
+FROM ${PYTHON_IMAGE}
 
 # libexpat1: a system library of the raster driver's wheel. postgresql-client: amers db backup and restore;
 # its version is not older than the server of docker-compose.yml.

@@ -49,6 +49,7 @@ class Settings(BaseSettings):
     Attributes:
         database_url: PostgreSQL with PostGIS, `postgresql://user:password@host/name`; None runs a
             private cluster in the data folder.
+        database_password_file: file with the password of its user, as it is; None: the address has it.
         data_folder: for the private cluster and the stored files.
         host, port: that the API listens on.
         upload_limit_bytes: largest upload of an image or a block.
@@ -101,6 +102,7 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="AMERS_", frozen=True)
 
     database_url: SecretStr | None = None
+    database_password_file: Path | None = None
     data_folder: Path = Field(default_factory=default_data_folder)
     host: str = "127.0.0.1"
     port: int = Field(default=8000, ge=1, le=65535)

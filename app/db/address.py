@@ -1,14 +1,16 @@
 """The address of a database of your own: checked before use, in errors without its password."""
 
 import re
+from pathlib import Path
 
 import psycopg
-from psycopg.conninfo import conninfo_to_dict
+from psycopg.conninfo import conninfo_to_dict, make_conninfo
 
 from app.errors import InputError
 from app.outages import connection_failure
 
 VARIABLE = "AMERS_DATABASE_URL"
+PASSWORD_VARIABLE = "AMERS_DATABASE_PASSWORD_FILE"
 EXPECTED = "postgresql://USER:PASSWORD@HOST:PORT/NAME"
 SCHEMES = ("postgresql", "postgres")
 
@@ -48,6 +50,29 @@ def check_address(url: str) -> None:
         raise InputError(UNREADABLE) from None
     if not (_is_clear_url(url) if scheme in SCHEMES and separator else _are_clear_pairs(url)):
         raise InputError(UNREADABLE)
+
+
+def with_password(url: str, file: Path | None) -> str:
+    """The connection string with the password that a file has, as it is but for a line break at its end.
+
+    Raises:
+        InputError: the file cannot be read, is empty or has more than one line.
+    """
+    if file is None:
+        return url
+    try:
+        password = file.read_text(encoding="utf-8").removesuffix("\n").removesuffix("\r")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not text in UTF-8"
+        raise InputError(
+            f"{PASSWORD_VARIABLE}: {file} cannot be read ({reason}): name a file that this user can read "
+            "with the password of the database's user"
+        ) from None
+    if not password or set(password) & set("\0\r\n"):
+        raise InputError(
+            f"{PASSWORD_VARIABLE}: {file} needs one line, the password of the database's user"
+        )
+    return make_conninfo(url, password=password)
 
 
 def unreachable(error: psycopg.OperationalError, dsn: str) -> InputError:

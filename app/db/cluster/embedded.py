@@ -28,7 +28,7 @@ from psycopg.pq import PGconn, Ping
 from app import reserve
 from app.config import Settings
 from app.db import session
-from app.db.address import check_address
+from app.db.address import check_address, with_password
 from app.db.cluster.binaries import ServerUser, find_binaries, run_as, server_user
 from app.db.sql_files import sql_file
 from app.errors import InputError
@@ -76,7 +76,7 @@ def database(settings: Settings) -> Iterator[str]:
     if settings.database_url is not None:
         url = settings.database_url.get_secret_value()
         check_address(url)
-        yield url
+        yield with_password(url, settings.database_password_file)
         return
     with _cluster(settings).lease() as dsn:
         yield dsn
