@@ -13,14 +13,15 @@ VARIABLE = re.compile(r"\$(?:(\$)|\{(\w+)(?::-([^}]*))?\})")
 
 
 def compose(environment: Mapping[str, str]) -> dict[str, Any]:
-    """The services, volumes and secrets under an environment; a variable without a value may be missing."""
+    """The services, volumes and secrets under an environment."""
     document = yaml.safe_load(VARIABLE.sub(lambda found: _value(found, environment), TEXT))
     for service in document["services"].values():
         variables = service.get("environment", {})
-        own = {
-            name: environment.get(name) if value is None else value for name, value in variables.items()
+        service["environment"] = {
+            name: environment[name] if value is None else value
+            for name, value in variables.items()
+            if value is not None or name in environment
         }
-        service["environment"] = {name: value for name, value in own.items() if value is not None}
     return dict(document)
 
 

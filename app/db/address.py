@@ -65,8 +65,8 @@ def with_password(url: str, file: Path | None) -> str:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not text in UTF-8"
         raise InputError(
-            f"{PASSWORD_VARIABLE}: {file} cannot be read ({reason}): name a file that this user can read "
-            "with the password of the database's user"
+            f"{PASSWORD_VARIABLE}: {file} cannot be read ({reason}): name a file that this user can "
+            "read, with the password of the database's user"
         ) from None
     if not password or set(password) & set("\0\r\n"):
         raise InputError(
