@@ -17,6 +17,7 @@ import httpx
 import psycopg
 import pytest
 
+from app.db import revisions
 from tests.app.operators_server import (
     PASSWORD,
     SUPERUSER,
@@ -26,6 +27,7 @@ from tests.app.operators_server import (
 )
 from tests.compose_file import compose, image_environment
 from tests.confined import Confinement, owned_folder, path_of_amers, skip_unless_possible
+from tests.run_folders import place_of_databases, run_folder
 from tests.service_process import free_port, until
 
 pytestmark = [pytest.mark.database, pytest.mark.long, pytest.mark.thorough]
@@ -109,12 +111,10 @@ def psql(server: OperatorsServer, file: str, *options: str) -> "subprocess.Compl
 
 
 @pytest.fixture
-def server(open_folder: Path) -> Iterator[OperatorsServer]:
+def server() -> Iterator[OperatorsServer]:
     if shutil.which("psql") is None:
         pytest.skip("psql is missing: nothing can do what the image of the database does")
-    folder = open_folder / uuid4().hex[:8]
-    folder.mkdir(mode=0o755)
-    with running_server(folder) as server:
+    with run_folder(place_of_databases()) as folder, running_server(folder) as server:
         yield server
 
 
@@ -153,8 +153,9 @@ def test_the_database_is_made_for_an_ordinary_role_and_its_superuser_is_closed(
     )
     assert other.returncode == 0, other.stderr
     second = server.dsn("second store", "second one")
-    assert server.rows(second, "select to_regtype('geometry')::text") == [("geometry",)]
-    log = "".join(path.read_text() for path in secrets.parent.glob("*/server/log"))
+    assert server.rows(second, "select to_regtype('gis.geometry')::text") == [("gis.geometry",)]
+    revisions.upgrade(second)
+    log = (server.data / "log").read_text()
     assert PASSWORD not in log
     assert "password" not in log
 

@@ -26,6 +26,7 @@ from app.db.cluster import programs
 from app.usecases.tokens import create_token
 from tests.app.operators_server import PASSWORD, OperatorsServer, running_server
 from tests.confined import NOBODY, owned_folder, skip_unless_possible
+from tests.run_folders import place_of_databases, run_folder
 from tests.service_process import free_port
 from tests.test_container_steps import psql
 from tests.units import (
@@ -186,10 +187,8 @@ class Systemd:
 
 
 @pytest.fixture
-def server(open_folder: Path) -> Iterator[OperatorsServer]:
-    folder = open_folder / uuid4().hex[:8]
-    folder.mkdir(mode=0o755)
-    with running_server(folder) as server:
+def server() -> Iterator[OperatorsServer]:
+    with run_folder(place_of_databases()) as folder, running_server(folder) as server:
         yield server
 
 

@@ -18,7 +18,8 @@ select current_user::text as role, current_database()::text as database,
     (select quote_ident(nspname) from pg_extension e join pg_namespace n on n.oid = e.extnamespace
      where extname = 'postgis') as postgis,
     to_regtype('geometry') is not null as is_found,
-    coalesce(has_schema_privilege(to_regnamespace('public'), 'create'), false) as may_create"""
+    quote_ident(coalesce(current_schema(), 'public')) as schema,
+    coalesce(has_schema_privilege(current_schema(), 'create'), false) as may_create"""
 SECTION = 'see "A database of your own" in docs/operations.md'
 
 
@@ -30,6 +31,7 @@ class _State:
     quoted_database: str
     postgis: str | None
     is_found: bool
+    schema: str
     may_create: bool
 
 
@@ -61,9 +63,9 @@ def prepare(connection: Connection) -> str:
         )
     if not state.may_create:
         raise InputError(
-            f"the role {state.role} may not make tables in schema public of database {state.database}: "
-            f"let a superuser run `alter database {database} owner to {role}` or "
-            f"`grant create on schema public to {role}`; {SECTION}"
+            f"the role {state.role} may not make tables in schema {state.schema} of database "
+            f"{state.database}: let a superuser run `alter database {database} owner to {role}` or "
+            f"`grant create on schema {state.schema} to {role}`; {SECTION}"
         )
     return str(state.postgis)
 

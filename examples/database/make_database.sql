@@ -49,5 +49,4 @@ create extension postgis schema :"postgis_schema";
 select :'postgis_schema' <> 'public' as is_elsewhere \gset
 \if :is_elsewhere
 grant usage on schema :"postgis_schema" to :"role", amers_reader;
-alter database :"database" set search_path = public, :"postgis_schema";
 \endif

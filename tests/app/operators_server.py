@@ -37,9 +37,11 @@ class OperatorsServer:
 
     Attributes:
         port: on 127.0.0.1.
+        data: PostgreSQL's data directory, with its log.
     """
 
     port: int
+    data: Path
 
     def dsn(self, name: str, role: str, password: str | None = PASSWORD) -> str:
         """The connection string of a role."""
@@ -77,9 +79,7 @@ class OperatorsServer:
                 "create schema if not exists {schema}",
                 "create extension postgis schema {schema}",
                 "grant usage on schema {schema} to public",
-                "alter database {name} set search_path = public, {schema}",
                 schema=postgis,
-                name=name,
             )
         return self.dsn(name, role)
 
@@ -94,7 +94,7 @@ def running_server(folder: Path) -> Iterator[OperatorsServer]:
     """A server of this test alone, below a folder that the server's user can pass."""
     binaries, user, data = find_binaries(), server_user(folder / "server"), folder / "server"
     data.mkdir(mode=0o700)
-    server = OperatorsServer(free_port())
+    server = OperatorsServer(free_port(), data)
     password = folder / "password"
     try:
         os.chown(data, user.uid, user.gid)

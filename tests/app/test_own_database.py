@@ -7,7 +7,7 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
+from urllib.parse import quote
 
 import psycopg
 import pytest
@@ -28,6 +28,7 @@ from tests.app.full_storage import Full, contents, run_service
 from tests.app.operators_server import PASSWORD, OperatorsServer, running_server
 from tests.app.test_schema import catalogue, differences
 from tests.command_line import Done, amers_here
+from tests.run_folders import place_of_databases, run_folder
 
 pytestmark = [pytest.mark.database, pytest.mark.long]
 
@@ -36,10 +37,8 @@ SERVERS_OWN = ("--format=custom", "--no-owner", "--no-privileges")
 
 
 @pytest.fixture(scope="module")
-def server(open_folder: Path) -> Iterator[OperatorsServer]:
-    folder = open_folder / uuid4().hex[:8]
-    folder.mkdir(mode=0o755)
-    with running_server(folder) as server:
+def server() -> Iterator[OperatorsServer]:
+    with run_folder(place_of_databases()) as folder, running_server(folder) as server:
         yield server
 
 
@@ -198,6 +197,27 @@ def test_postgis_in_a_schema_of_its_own_is_backed_up_and_restored(
 
 
 @pytest.mark.thorough
+def test_tables_in_a_schema_of_their_own_are_backed_up_and_restored(
+    server: OperatorsServer, tmp_path: Path
+):
+    one, other = server.make_database(), server.make_database()
+    role = role_of(one)
+    server.run(
+        database_of(one),
+        "create schema {schema} authorization {role}",
+        "alter role {role} set search_path = {schema}, public",
+        schema="Of Amers",
+        role=role,
+    )
+    revisions.upgrade(one)
+    archive.dump(one, tmp_path / "a.dump")
+    archive.restore(other, tmp_path / "a.dump")
+    revisions.upgrade(other)
+    where = "select relnamespace::regnamespace::text from pg_class where relname = 'installation'"
+    assert server.rows(one, where) == server.rows(other, where) == [('"Of Amers"',)]
+
+
+@pytest.mark.thorough
 def test_postgis_in_another_schema_than_that_of_the_archive_is_refused_with_statements(
     server: OperatorsServer, backup: Path, tmp_path: Path
 ):
@@ -320,6 +340,26 @@ def test_the_password_is_on_no_command_line_and_a_file_of_passwords_serves_all_p
     bare = server.dsn(database_of(kept.dsn), role_of(kept.dsn), None)
     archive.dump(bare, tmp_path / "b.dump")
     assert (tmp_path / "b.dump").stat().st_size > 0
+
+
+def test_a_file_has_the_password_as_it_is(server: OperatorsServer, kept: Full, tmp_path: Path):
+    file, address = tmp_path / "password", f"postgresql://{role_of(kept.dsn)}@127.0.0.1:{server.port}"
+    url = f"{address}/{quote(database_of(kept.dsn))}"
+    settings = {"AMERS_DATABASE_URL": url, "AMERS_DATABASE_PASSWORD_FILE": str(file)}
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("AMERS_")}
+    for content in (PASSWORD, f"{PASSWORD}\n", f"{PASSWORD}\r\n"):
+        file.write_bytes(content.encode())
+        told = amers_here(["db", "status"], environment | settings)
+        assert told.returncode == 0, told.stderr
+    for content in ("", "\n", f"{PASSWORD}\n{PASSWORD}", "\xff"):
+        file.write_bytes(content.encode("latin-1"))
+        refused = amers_here(["db", "status"], environment | settings)
+        assert refused.returncode == 2
+        assert "AMERS_DATABASE_PASSWORD_FILE" in refused.stderr
+        assert PASSWORD[:4] not in refused.stderr
+    file.unlink()
+    refused = amers_here(["db", "status"], environment | settings)
+    assert "No such file" in refused.stderr
 
 
 def test_a_client_that_is_older_than_the_server_is_refused_before_it_is_run(

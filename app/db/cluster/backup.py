@@ -1,8 +1,9 @@
 """Backup and restore of the database, by PostgreSQL's own programs.
 
-An archive holds what Amers owns: tables, functions and rows of the schema `public`. What belongs to a
-superuser stays with the server: PostGIS with its tables, other extensions, schemas of others, roles and
-grants. So a role without further rights restores what it has backed up, archives of former versions too.
+An archive holds what Amers owns: tables, functions and rows of its schema, usually `public`. What
+belongs to a superuser stays with the server: PostGIS with its tables, other extensions, schemas of
+others, roles and grants. So a role without further rights restores what it has backed up, archives of
+former versions too.
 """
 
 import logging
@@ -15,17 +16,18 @@ from app.db.preparation import prepare
 from app.db.revisions import driver_connection
 from app.errors import Conflict, InputError
 
-OWN = ("--schema=public", "--extension=postgis")
-"""With PostGIS named alone, no extension of others is read, whose tables may be closed to this role."""
+POSTGIS_ALONE = "--extension=postgis"
+"""No extension of others is read, whose tables may be closed to this role."""
 LOCK_WAIT = "60s"
 PLAIN = ("--no-owner", "--no-privileges")
 NOT_OURS = ("--no-comments", "--no-publications", "--no-subscriptions", "--no-security-labels")
 WHOLE = ("--single-transaction", "--exit-on-error", "--no-tablespaces")
-OF_THE_SERVER = re.compile(r"\d+; \d+ \d+ (SCHEMA|EXTENSION|COMMENT|DEFAULT ACL|ACL) ")
+OF_THE_SERVER = re.compile(r"\d+; \d+ \d+ (SCHEMA - public|EXTENSION|COMMENT|DEFAULT ACL|ACL) ")
 TABLE = re.compile(r"\d+; \d+ \d+ TABLE (?!DATA )(.*)")
 TABLE_DATA = re.compile(r"\d+; \d+ \d+ TABLE DATA (.*)")
 REFERENCE_SYSTEMS = re.compile(r"\d+; \d+ \d+ TABLE DATA (.+) spatial_ref_sys ")
-OWN_TABLES = """select relname from pg_class where relnamespace = to_regnamespace('public')
+OWN_TABLES = """select relname from pg_class
+    where relnamespace = to_regnamespace(quote_ident(current_schema()))
     and relkind in ('r', 'p', 'v', 'm', 'f') and not exists (select from pg_depend
         where classid = 'pg_class'::regclass and objid = pg_class.oid and deptype = 'e')
     order by relname"""
@@ -50,7 +52,8 @@ def dump(dsn: str, file: Path, snapshot: str | None = None) -> None:
         raise Conflict(f"{file} exists")
     unfinished = file.with_name(f".{file.name}.unfinished")
     try:
-        options = ["--format=custom", *PLAIN, *OWN, f"--lock-wait-timeout={LOCK_WAIT}"]
+        options = ["--format=custom", *PLAIN, POSTGIS_ALONE, f"--lock-wait-timeout={LOCK_WAIT}"]
+        options.append(f"--schema={_own_schema(dsn)}")
         options += [] if snapshot is None else [f"--snapshot={snapshot}"]
         run_program(dsn, "pg_dump", *options, f"--file={unfinished}")
         unfinished.replace(file)
@@ -119,6 +122,14 @@ def has_tables(dsn: str) -> bool:
     with driver_connection(dsn) as connection:
         row = connection.execute("select to_regclass('alembic_version')").fetchone()
     return row != (None,)
+
+
+def _own_schema(dsn: str) -> str:
+    """The schema of the tables, as an identifier of SQL."""
+    with driver_connection(dsn) as connection:
+        row = connection.execute("select quote_ident(current_schema())").fetchone()
+    assert row is not None
+    return str(row[0])
 
 
 def _of_amers(entries: list[str]) -> list[str]:
