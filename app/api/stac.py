@@ -54,7 +54,7 @@ from app.db.features.outlines import SCENES
 from app.errors import InvalidParameter
 from app.usecases.features import items as all_features
 from app.usecases.features import stac
-from app.usecases.features.query import FeatureQuery, ResolvedQuery, Restriction, crs_of, resolve
+from app.usecases.features.query import Bbox, FeatureQuery, ResolvedQuery, Restriction, crs_of, resolve
 
 router = APIRouter(tags=["stac"], route_class=CallerRoute)
 
@@ -155,6 +155,15 @@ class SceneSearch(SceneRestriction, FeatureQuery):
     sortby: Annotated[str | None, BeforeValidator(_without_prefix)] = Field(
         default=None, description="Properties to sort by; `-` before one sorts it descending."
     )
+    bbox: Bbox | None = Field(
+        default=None,
+        description="Box W,S,E,N; only scenes that have an outline, and that meets the box.",
+    )
+
+    @property
+    def restriction(self) -> Restriction:
+        """As of any request; a scene without an outline is in no box, as clients of STAC expect."""
+        return replace(super().restriction, has_geometry=self.bbox is not None)
 
 
 NOT_SEARCHED = {"crs", "properties"}

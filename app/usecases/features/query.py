@@ -145,10 +145,12 @@ class Restriction:
     Attributes:
         equal: pairs of a property's name and the value it must have, as text.
         ids: identifiers of the features; None for any.
+        has_geometry: whether features without a geometry are left out.
     """
 
     equal: tuple[tuple[str, str], ...] = ()
     ids: tuple[str, ...] | None = None
+    has_geometry: bool = False
 
 
 NO_RESTRICTION = Restriction()
@@ -223,6 +225,8 @@ def _restriction_conditions(collection: Collection, restriction: Restriction) ->
         yield translate(equal, collection, CRS84)
     if restriction.ids is not None:
         yield key_among(collection, restriction.ids)
+    if restriction.has_geometry:
+        yield Condition(non_bbox_predicate=collection.geometry.is_not(None))
 
 
 def _cql2_condition(query: FeatureFilter, collection: Collection, crs: Crs) -> Condition:

@@ -71,7 +71,8 @@ def test_a_box_meets_scenes_inside_and_those_without_an_outline_and_intersects_o
     assert count("scenes", bbox="0,0,1,1") == 1
     assert count("scenes", filter="S_INTERSECTS(geometry, BBOX(5, 43, 5.1, 43.1))") == 1
     shape = '{"type":"Polygon","coordinates":[[[5,43],[5.1,43],[5.1,43.1],[5,43]]]}'
-    assert get("/search", bbox="5,43,5.1,43.1").json()["numberMatched"] == 2
+    assert get("/search", bbox="5,43,5.1,43.1").json()["numberMatched"] == 1, "STAC: with an outline"
+    assert get("/search", bbox="-180,-90,180,90").json()["numberMatched"] == 2
     assert get("/search", intersects=shape).json()["numberMatched"] == 1
     assert get("/search", datetime="1990-01-01T00:00:00Z/..").json()["numberMatched"] == 3
 
