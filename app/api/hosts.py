@@ -60,7 +60,8 @@ class TrustedHosts:
             return None
         return (
             f"{hosts[0][:100]!r} is no name of this service; "
-            "its operator lists its public names in AMERS_TRUSTED_HOSTS"
+            "its operator states its public address in AMERS_PUBLIC_URL, further names in "
+            "AMERS_TRUSTED_HOSTS"
         )
 
     def _accepts(self, name: str, arrived_at: str) -> bool:

@@ -35,7 +35,7 @@ def run(descriptors: list[int]) -> None:
     """
     settings = read_settings()
     logs.configure(settings)
-    _log_public_address(settings)
+    log_public_address(settings)
     # What is imported stays: a search for garbage in it finds none.
     gc.disable()
     application = import_module("app.main").create_app
@@ -53,7 +53,7 @@ def run(descriptors: list[int]) -> None:
     _Server(config).run([socket.socket(fileno=number) for number in descriptors])
 
 
-def _log_public_address(settings: Settings) -> None:
+def log_public_address(settings: Settings) -> None:
     """Log the address of callers, and what is certainly missing for the proxy that has it."""
     if settings.public_url is None:
         return

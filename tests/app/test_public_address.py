@@ -4,6 +4,7 @@
 """
 
 import json
+import logging
 import re
 import shutil
 from collections import deque
@@ -15,6 +16,7 @@ from fastapi.routing import APIRoute
 from fastapi.testclient import TestClient
 
 from app.api.session_cookie import COOKIE
+from app.cli.api_process import log_public_address
 from app.config import Settings, read_settings
 from app.db import engine
 from app.errors import InputError
@@ -249,6 +251,28 @@ def test_a_deployment_whose_links_lead_elsewhere_says_so_to_whom_it_is_about(
 def test_a_proxy_that_is_not_named_is_told_to_whom_asks_through_it(client: TestClient):
     part = address_part(client, X_Forwarded_For="192.0.2.7")
     assert (part["status"], "AMERS_TRUSTED_PROXIES" in part["reason"]) == ("degraded", True)
+
+
+def test_a_wrong_address_is_logged_once_for_whoever_reads_no_readiness(
+    client: TestClient, caplog: pytest.LogCaptureFixture
+):
+    assert client.get("/").status_code == 200
+    for _ in range(3):
+        client.get("/", headers={"X-Forwarded-Prefix": "/gcp\x1b[2J"})
+    (line,) = [record.getMessage() for record in caplog.records if "PUBLIC_URL" in record.getMessage()]
+    assert "/gcp" in line
+    assert line.isprintable()
+
+
+@pytest.mark.parametrize(
+    ("url", "proxies", "warns"),
+    [(PUBLIC, (), True), (PUBLIC, ("127.0.0.1/32",), False), ("http://gcp.example.org/", (), False)],
+)
+def test_tls_without_a_named_proxy_is_told_at_the_start(settings, caplog, url, proxies, warns):
+    caplog.set_level(logging.INFO)
+    log_public_address(settings.model_copy(update={"public_url": url, "trusted_proxies": proxies}))
+    assert f"callers use {url}" in caplog.text
+    assert ("AMERS_TRUSTED_PROXIES names none" in caplog.text) == warns
 
 
 def test_a_path_that_is_not_there_names_where_paths_begin(client: TestClient):

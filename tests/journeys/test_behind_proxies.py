@@ -105,12 +105,13 @@ def job(service: Service, secret: str, world: FlatWorld) -> str:
 def address(
     request: pytest.FixtureRequest,
     service: Service,
+    job: str,
     public: str,
     tls_port: int,
     certificate: Certificate,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[str]:
-    """The public address, behind one of the proxies."""
+    """The public address, behind one of the proxies, of a service with points and a registered scene."""
     folder = tmp_path_factory.mktemp("proxy")
     ports = Ports(tls_port, free_port(), service.port)
     if request.param == "Caddy":
@@ -182,16 +183,18 @@ def test_the_deployment_of_the_example_is_right(http: httpx.Client, address: str
     )
 
 
-def test_a_compressed_tile_that_the_client_has_is_not_sent_again(http: httpx.Client):
+def test_a_compressed_tile_that_the_client_has_is_not_sent_again(http: httpx.Client, world: FlatWorld):
     landing = http.get("collections/points/tiles/WebMercatorQuad").json()
     template = next(link["href"] for link in landing["links"] if link["rel"] == "item")
-    places = {"{tileMatrix}": "12", "{tileRow}": "1496", "{tileCol}": "2107"}
+    places = {"{tileMatrix}": "12", "{tileRow}": "1501", "{tileCol}": "2107"}
     url = re.sub(r"\{\w+\}", lambda place: places[place[0]], template)
     tile = http.get(url)
     assert tile.status_code == 200
     tag = tile.headers["etag"]
     again = http.get(url, headers={"If-None-Match": tag})
-    assert (again.status_code, tag) == (304, tag)
+    assert again.status_code == 304
+    if tile.headers["server"].startswith("nginx"):
+        assert (tile.headers["content-encoding"], tag[:2]) == ("gzip", "W/")
 
 
 def test_browsers_sign_in_below_the_path(http: httpx.Client, address: str, secret: str):
