@@ -57,7 +57,17 @@ class NoSuchJob(NotFound):
 
 
 class StorageOutage(Exception):
-    """The file storage does not answer. Not the user's fault: a job that meets it is tried again."""
+    """The file storage does not answer, or is not that of this installation.
+
+    Not the user's fault: a job that meets it is tried again, as often as it takes.
+
+    Attributes:
+        reason: for callers, without any place of this machine; half a sentence.
+    """
+
+    def __init__(self, message: str, reason: str = "the storage of files does not answer") -> None:
+        super().__init__(message)
+        self.reason = reason
 
 
 class Conflict(AmersError):

@@ -10,6 +10,7 @@ from fastapi import APIRouter, FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware.cors import CORSMiddleware
 
+from app import reserve
 from app.api import (
     blocks,
     chips,
@@ -99,9 +100,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         app.state.settings = settings
         app.state.database = await run_in_threadpool(opening.__enter__)
         app.state.storage = open_storage(settings)
-        await run_in_threadpool(
+        if await run_in_threadpool(
             storage_identity.announce, app.state.database.transaction, app.state.storage
-        )
+        ):
+            await run_in_threadpool(reserve.keep, settings)
         app.state.chips = open_chips(app.state.database, app.state.storage)
         app.state.readiness = Readiness(Installation(app.state.database, app.state.storage, settings))
         try:

@@ -136,16 +136,27 @@ BY_WORDS: tuple[tuple[str, Outage], ...] = (
     ("certificate|SSL|TLS", _database("no encrypted connection can be agreed on", again=False)),
 )
 """By the words of an error without SQLSTATE: of the driver, when a connection begins or ends."""
+NO_ROOM = Outage(
+    "storage", "a disk of the service is full; no part of this was stored: try again later", status=507
+)
 BY_ERRNO: dict[int, Outage] = {
-    number: Outage(
-        "storage",
-        "a disk of the service is full; no part of this was stored: try again later",
-        status=507,
-    )
-    for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    errno.ENOSPC: NO_ROOM,
+    errno.EDQUOT: NO_ROOM,
+    errno.EFBIG: NO_ROOM,
+    errno.EROFS: Outage("storage", "a disk of the service is mounted read-only: nothing can be stored"),
+    errno.EACCES: Outage("storage", "the service has no rights to a file or folder of its own"),
+    errno.EPERM: Outage("storage", "the service may not do this to a file or folder of its own"),
+    errno.EIO: Outage("storage", "a disk of the service reports errors of input and output"),
+    errno.EUCLEAN: Outage("storage", "the file system of a disk of the service is damaged"),
+    errno.ESTALE: Outage(
+        "storage", "a network disk of the service is stale: it has to be mounted again"
+    ),
+    **dict.fromkeys(
+        (errno.ENODEV, errno.ENXIO, errno.ENOTCONN, errno.EHOSTDOWN),
+        Outage("storage", "a disk of the service is gone"),
+    ),
 }
 """Of the files, by the number of an error of the operating system."""
-STORAGE_SILENT = Outage("storage", "the storage of files does not answer")
 
 
 def outage_of(error: BaseException) -> Outage | None:
@@ -169,7 +180,7 @@ def connection_failure(error: BaseException) -> str:
 
 def _outage(error: BaseException) -> Outage | None:
     if isinstance(error, StorageOutage):
-        return STORAGE_SILENT
+        return Outage("storage", error.reason)
     if _is_of_driver(error):
         return _of_database(error)
     if isinstance(error, OSError) and error.errno is not None:

@@ -117,6 +117,10 @@ def _refused(request: Request, error: Exception) -> JSONResponse:
 def _damaged(request: Request, error: Exception) -> JSONResponse:
     """The reply to damage in the storage, which the operator has to repair."""
     assert isinstance(error, DamagedFile)
+    try:
+        request.app.state.storage.prove()
+    except StorageOutage as outage:
+        return _failed(request, outage)
     if not report_damage(request.app.state.database, error):
         return problem(404, f"{error.key} was removed meanwhile", error=NotFound.__name__)
     return problem(500, str(error), error=DamagedFile.__name__)

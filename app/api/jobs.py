@@ -19,7 +19,7 @@ from app.errors import NoSuchJob
 from app.usecases import jobs, results
 from app.usecases.media_types import media_type
 from app.usecases.processes import results_folder
-from app.usecases.results import delete_files
+from app.usecases.results import delete_removed
 
 router = APIRouter(tags=["jobs"], route_class=CallerRoute)
 
@@ -127,11 +127,15 @@ def dismiss_job(
     The worker of a dismissed job stops within seconds. The measures of a registration stay in the
     histories of its points.
     """
+    with database.reading() as connection:
+        is_ended = jobs.visible_job(connection, caller, job_id).finished_at is not None
+    if is_ended:
+        storage.prove()
     with database.transaction() as connection:
         job = jobs.dismiss(connection, caller, job_id)
         names = jobs.names_of_scenes(connection, [job])
     if job.results_removed_at is not None:
-        after_commit.add_task(delete_files, storage, results_folder(job_id))
+        after_commit.add_task(delete_removed, storage, results_folder(job_id))
     return status_info(request, job, names)
 
 

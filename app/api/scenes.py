@@ -169,6 +169,7 @@ def remove_scene(
     after_commit: BackgroundTasks,
 ) -> None:
     """Remove the files of a scene; its record, its jobs and their results stay."""
+    storage.prove()
     with database.transaction() as connection:
         scenes.remove_scene(connection, caller, scene_id)
     after_commit.add_task(scenes.delete_files, storage, scene_id)

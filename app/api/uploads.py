@@ -92,6 +92,7 @@ def create(
     the reply is the id of the scene.
     """
     new = _new_upload(upload_length, upload_metadata)
+    storage.prove()
     with database.transaction() as connection:
         upload = uploads.create_upload(connection, storage, settings, caller, new)
     location = {"Location": f"{request.base_url}uploads/{upload.id}"}
@@ -174,6 +175,7 @@ def terminate(
     *, upload_id: UUID, database: DatabaseDep, storage: StorageDep, caller: Registrar
 ) -> Response:
     """Terminate an upload that is not complete, and delete the bytes that have arrived."""
+    storage.prove()
     with database.transaction() as connection:
         uploads.terminate_upload(connection, storage, uploads.find_upload(connection, caller, upload_id))
     return Response(status_code=204, headers=TUS)

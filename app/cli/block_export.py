@@ -11,7 +11,7 @@ from app.cli.progress import shown_progress
 from app.config import read_settings
 from app.db.engine import opened
 from app.errors import InputError
-from app.storage import open_storage
+from app.usecases import storage_identity
 from app.usecases.blocks.export import ExportBlock, select_points, write_selected
 from app.usecases.damage import open_chips
 
@@ -36,7 +36,7 @@ def export(
     with opened(settings) as database:
         with database.snapshot() as connection:
             selected = select_points(connection, inputs)
-        chips = open_chips(database, open_storage(settings))
+        chips = open_chips(database, storage_identity.opened(database, settings))
         try:
             with shown_progress() as progress:
                 n_points = write_selected(selected, chips, output, progress)

@@ -33,6 +33,7 @@ def ingest(
     storage = open_storage(settings)
     with transaction(settings) as connection:
         storage_identity.announce(partial(transaction, settings), storage)
+        storage.prove()
         with shown_progress() as progress:
             ingested = lifecycle.ingest_block(connection, storage, path, progress, priority)
         block = ingested.block

@@ -13,7 +13,7 @@ from app.cli.transaction import transaction
 from app.config import read_settings
 from app.db.engine import opened
 from app.errors import InputError
-from app.storage import open_storage
+from app.usecases import storage_identity
 from app.usecases.blocks import lifecycle
 from app.usecases.blocks.quality import (
     HeightFiles,
@@ -166,7 +166,7 @@ def quality(
         else:
             settings = read_settings()
             with opened(settings) as database:
-                storage = open_storage(settings)
+                storage = storage_identity.opened(database, settings)
                 report = assess_stored(database, storage, block, references, required, progress=progress)
     if output is not None:
         write_quality(report, output)

@@ -46,6 +46,7 @@ def renew(
     storage = open_storage(settings)
     with transaction(settings):
         storage_identity.announce(partial(transaction, settings), storage)
+        storage.prove()
     with (
         opened(settings) as database,
         TemporaryDirectory(prefix="amers-renewal-") as scratch,

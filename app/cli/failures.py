@@ -5,7 +5,7 @@ import traceback
 import typer
 
 from app.cli.exit_status import FAILURE, REFUSED, exit_status
-from app.errors import AmersError, is_no_memory, is_no_room
+from app.errors import AmersError, StorageOutage, is_no_memory, is_no_room
 from app.outages import outage_of
 from app.printable import printable
 
@@ -26,6 +26,8 @@ def _sentence(error: Exception) -> str:
         return f"{error}: a disk is full; free some room, then run the command again"
     if is_no_memory(error):
         return f"{error}: this process got no more memory; use smaller inputs or fewer --jobs"
+    if isinstance(error, StorageOutage):
+        return f"{error}; see that the storage is mounted and can be used, then run the command again"
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}; expected a place that this user can use"
     if _comes_from(error, "app.client.errors"):

@@ -16,7 +16,7 @@ from app.config import read_settings
 from app.db import engine
 from app.db.engine import Database
 from app.errors import AmersError, ComputationError, InputError
-from app.storage import open_storage
+from app.usecases import storage_identity
 from app.usecases.executors import ComputeOptions
 from app.usecases.registration.control_sources import FindPoints, points_of_block, points_of_store
 from app.usecases.registration.joined_scenes import read_joined
@@ -144,7 +144,7 @@ def _control(request: JointRequest) -> Iterator[tuple[FindPoints, Database | Non
         return
     settings = read_settings()
     with engine.opened(settings) as database:
-        yield points_of_store(database, open_storage(settings)), database
+        yield points_of_store(database, storage_identity.opened(database, settings)), database
 
 
 def _run(request: JointRequest, find_points: FindPoints, folders: dict[str, Path]) -> JointOutcome:

@@ -22,7 +22,7 @@ from app.config import Settings, read_settings
 from app.db import engine
 from app.db.engine import Database
 from app.errors import AmersError, ComputationError, InputError
-from app.storage import open_storage
+from app.usecases import storage_identity
 from app.usecases.references import references_of_store
 from app.usecases.registration.control_sources import points_of_block, points_of_store
 from app.usecases.registration.failure import FAILURE_OUTPUTS, Attempt, write_failure
@@ -314,7 +314,7 @@ def _run(
 
 def _on_store(database: Database, settings: Settings) -> Register:
     """A function that registers scenes on the store and records the registrations there."""
-    storage = open_storage(settings)
+    storage = storage_identity.opened(database, settings)
     sources = ControlSources(points_of_store(database, storage), references_of_store(database, settings))
 
     def register_one(request: SceneRequest, folder: Path, progress: Progress) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from app.cli.deletion import giving_up_reserve
 from app.cli.output import AsJson, Row, as_size, print_json, show, show_one
 from app.cli.progress import shown_progress
 from app.cli.transaction import transaction
@@ -30,9 +31,12 @@ def adopt(as_json: AsJson = False) -> None:
 def show_usage(as_json: AsJson = False) -> None:
     """Show what every owner keeps in the storage, and what belongs to nobody."""
     settings = read_settings()
+    storage = open_storage(settings)
     with transaction(settings) as connection:
+        if storage_identity.expect(connection, storage).storage_generation > 0:
+            storage.prove()
         owners = usage.read_all_usage(connection, settings)
-        unowned = usage.read_unowned(connection, open_storage(settings))
+        unowned = usage.read_unowned(connection, storage)
     total_bytes = sum(row.total_bytes for row in owners) + sum(row.total_bytes for row in unowned)
     if as_json:
         print_json({"owners": owners, "unowned": unowned, "total_bytes": total_bytes})
@@ -57,6 +61,7 @@ def show_usage(as_json: AsJson = False) -> None:
     show(rows, as_json=False)
 
 
+@giving_up_reserve
 def sweep(as_json: AsJson = False) -> None:
     """Move all files that no row of the database knows into the trash, however many they are."""
     settings = read_settings()

@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from app.cli.deletion import giving_up_reserve
 from app.cli.output import AsJson, show, show_one
 from app.config import read_settings
 from app.db import engine
@@ -24,13 +25,18 @@ def restore(
     as_json: AsJson = False,
 ) -> None:
     """Put the files of a batch back, except those whose place is taken."""
-    storage = open_storage(read_settings())
+    settings = read_settings()
+    storage = open_storage(settings)
+    with engine.opened(settings) as database, database.reading() as connection:
+        storage_identity.expect(connection, storage)
+    storage.prove()
     keys = trash.batches(storage).get(batch)
     if keys is None:
         raise InputError(f"no batch {batch} in the trash: `amers store trash list` lists them")
     show([{"key": key} for key in trash.put_back(storage, batch, keys)], as_json=as_json)
 
 
+@giving_up_reserve
 def empty(as_json: AsJson = False) -> None:
     """Delete all files in the trash."""
     settings = read_settings()

@@ -2,17 +2,18 @@
 
 from app.config import Settings
 from app.storage.chips import StoredChips
-from app.storage.folder import (
+from app.storage.files import (
     KEY,
     UNFINISHED,
     FileState,
     RangeReader,
-    Storage,
     StoredFile,
     Writing,
     chips_key,
 )
+from app.storage.folder import Storage
 from app.storage.marker import MARKER, Marker, read_marker, write_marker
+from app.storage.proof import Proof
 
 __all__ = [
     "KEY",
@@ -35,12 +36,15 @@ __all__ = [
 def open_storage(settings: Settings) -> Storage:
     """The storage of an installation: a bucket where `storage_url` names one, else its data folder.
 
+    Nothing is written into it without the marker of the installation, which use cases tell it before
+    they write (`storage_identity`).
+
     Raises:
         InputError: `storage_url` names a bucket that cannot be used.
     """
     folder = settings.data_folder / "storage"
     if settings.storage_url is None:
-        return Storage(folder)
+        return Storage(folder, proof=Proof())
     from app.storage.bucket import BucketStorage  # 0.1 s and 10 MB that a folder does not need
 
-    return BucketStorage(folder, settings.storage_url)
+    return BucketStorage(folder, settings.storage_url, proof=Proof())

@@ -2,7 +2,7 @@
 
 import io
 import os
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
@@ -14,7 +14,9 @@ from obstore.exceptions import BaseError
 from obstore.store import S3Store
 
 from app.errors import InputError, NotFound, StorageOutage
-from app.storage.folder import COPY_BYTES, FileState, RangeReader, Storage, checked_key
+from app.storage.files import COPY_BYTES, UNFINISHED, FileState, RangeReader, checked_key
+from app.storage.folder import Storage
+from app.storage.marker import MARKER, Marker, parse_marker
 
 RETRIES = 3
 RETRY_TIMEOUT = timedelta(seconds=20)
@@ -55,6 +57,28 @@ class BucketStorage(Storage):
         """The address of the bucket."""
         return self.url
 
+    def look(self) -> Hashable:
+        """The address of the bucket: nothing but its marker tells it from another one."""
+        return self.url
+
+    def look_closely(self) -> tuple[Hashable, Marker | None]:
+        """The address of the bucket, and the marker there.
+
+        Raises:
+            InputError: the marker cannot be understood.
+            StorageOutage: the bucket does not answer.
+        """
+        try:
+            with _storage_errors(MARKER):
+                content = bytes(obstore.get(self.store, MARKER).bytes())
+        except NotFound:
+            return self.url, None
+        return self.url, parse_marker(content)
+
+    def _make_scratch(self) -> None:
+        """Make the folder for unfinished files of this machine."""
+        (self.folder / UNFINISHED).mkdir(mode=0o700, parents=True, exist_ok=True)
+
     def local(self, key: str) -> Path | None:
         """None: the files of a bucket do not lie on this machine."""
         return None
@@ -94,22 +118,27 @@ class BucketStorage(Storage):
 
     def state(self, key: str) -> FileState:
         """The size of a file, its time, and a text that changes with its content."""
-        with _storage_errors(key):
-            found = obstore.head(self.store, checked_key(key))
+        try:
+            with _storage_errors(key):
+                found = obstore.head(self.store, checked_key(key))
+        except NotFound:
+            self.prove()
+            raise
         modified_s = found["last_modified"].timestamp()
         return FileState(int(found["size"]), modified_s, f"{modified_s}-{found['e_tag']}")
 
     def exists(self, key: str) -> bool:
         """Whether there is a file of this key."""
         try:
-            self.size(key)
+            with _storage_errors(key):
+                obstore.head(self.store, checked_key(key))
         except NotFound:
             return False
         return True
 
     def delete(self, key: str) -> None:
         """Delete a file, if it exists."""
-        with _storage_errors(key):
+        with self.proven(), suppress(NotFound), _storage_errors(key):
             obstore.delete(self.store, checked_key(key))
 
     def move(self, key: str, new_key: str) -> None:
@@ -117,7 +146,7 @@ class BucketStorage(Storage):
 
         The storage service copies the file; one that is too large for that goes through this machine.
         """
-        with suppress(NotFound), _storage_errors(key):
+        with self.proven(), suppress(NotFound), _storage_errors(key):
             if self.size(key) <= COPY_LIMIT_BYTES:
                 obstore.copy(self.store, checked_key(key), checked_key(new_key))
             else:
@@ -144,6 +173,7 @@ class BucketStorage(Storage):
 
     def _place(self, unfinished: Path, key: str) -> None:
         """Send a finished file to its key; a large one goes in several parts at once."""
+        self.prove()
         with _storage_errors(key):
             obstore.put(self.store, checked_key(key), unfinished)
         os.unlink(unfinished)

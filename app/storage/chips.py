@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.errors import DamagedFile, NotFound
-from app.storage.folder import RangeReader, Storage
+from app.storage.files import RangeReader
+from app.storage.folder import Storage
 from services.errors import FormatError
 from services.formats.chips.checksums import CHECKSUM, Checksums, damaged_rows
 from services.formats.chips.npy_files import MAX_HEADER_BYTES, ChipFile, parse_chip_header

@@ -1,95 +1,34 @@
 """Files by key in a folder: written completely or not at all, and read by position."""
 
 import fcntl
-import hashlib
 import os
-import re
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkstemp
-from typing import BinaryIO, Protocol
-from uuid import uuid4
+from typing import BinaryIO
+from uuid import UUID, uuid4
 
-from app.errors import InputError, NotFound, TooLarge
-
-UNFINISHED = "unfinished"
-COPY_BYTES = 1 << 20
-KEY = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*(/[A-Za-z0-9_][A-Za-z0-9_.\-]*)*")
-
-
-@dataclass(frozen=True)
-class StoredFile:
-    """A file in the storage.
-
-    Attributes:
-        sha256: in hexadecimal.
-    """
-
-    key: str
-    size_bytes: int
-    sha256: str
-
-
-@dataclass(frozen=True)
-class FileState:
-    """What identifies the content of a file without reading it.
-
-    Attributes:
-        modified_s: when it was stored, seconds since 1970.
-        version: a text that changes with the content.
-    """
-
-    size_bytes: int
-    modified_s: float
-    version: str
-
-
-class RangeReader(Protocol):
-    """An open file of the storage that is read by position; threads may share it."""
-
-    def read(self, start: int, length: int) -> bytes:
-        """`length` bytes from position `start`; fewer at the end of the file."""
-
-    def close(self) -> None:
-        """Close the file."""
-
-
-class Writing:
-    """A file that is being written into the storage; computes its size and checksum on the way."""
-
-    def __init__(self, file: BinaryIO, path: Path, limit_bytes: int | None) -> None:
-        self._file = file
-        self._path = path
-        self._limit_bytes = limit_bytes
-        self._hash = hashlib.sha256()
-        self.size_bytes = 0
-
-    def write(self, chunk: bytes) -> None:
-        """Append bytes.
-
-        Raises:
-            TooLarge: the file exceeds its limit.
-        """
-        self.size_bytes += len(chunk)
-        if self._limit_bytes is not None and self.size_bytes > self._limit_bytes:
-            raise TooLarge(f"the file exceeds the accepted size of {self._limit_bytes} bytes")
-        self._hash.update(chunk)
-        self._file.write(chunk)
-
-    @property
-    def sha256(self) -> str:
-        """Checksum of the bytes written so far, in hexadecimal."""
-        return self._hash.hexdigest()
-
-    def finish(self) -> Path:
-        """Write all bytes through to the disk; returns the path of the file."""
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        return self._path
+from app.errors import InputError, NotFound, StorageOutage
+from app.outages import outage_of
+from app.storage.files import (
+    COPY_BYTES,
+    UNFINISHED,
+    FileReader,
+    FileState,
+    RangeReader,
+    StoredFile,
+    Writing,
+    checked_key,
+    chips_key,
+    lock,
+    locked,
+)
+from app.storage.marker import MARKER, Marker, parse_marker
+from app.storage.proof import Proof
 
 
 @dataclass(frozen=True)
@@ -98,9 +37,100 @@ class Storage:
 
     A key consists of letters, digits, `_`, `-`, `.` and `/`; none of its parts begins with a dot. Links
     below the folder are not followed. A file appears under its key when it is complete and on the disk.
+
+    Attributes:
+        folder: of the files. Only `found` makes it.
+        proof: that the folder is that of the installation, which every write needs; None for a folder
+            without an installation, as tools have.
     """
 
     folder: Path
+    proof: Proof | None = field(default=None, kw_only=True, compare=False, repr=False)
+
+    def prove(self) -> None:
+        """Check that the storage is that of its installation.
+
+        Raises:
+            StorageOutage: it is not, as when it is not mounted.
+        """
+        if self.proof is not None:
+            self.proof.require(self)
+
+    @contextmanager
+    def proven(self) -> Iterator[None]:
+        """Write in a context: the storage is proved at its start, at its end, and anew after an error.
+
+        Raises:
+            StorageOutage: the storage is not that of its installation.
+        """
+        self.prove()
+        try:
+            yield
+        except OSError:
+            if self.proof is not None:
+                self.proof.forget()
+                self.prove()
+            raise
+        self.prove()
+
+    @contextmanager
+    def found(self, installation: UUID, *, new: bool = True) -> Iterator[None]:
+        """Write the first files of an installation: its marker among them.
+
+        Args:
+            installation: that the storage shall belong to.
+            new: whether the folder is made if there is none: only at the first start of an installation.
+
+        Raises:
+            StorageOutage: there is no such folder, and none is made.
+        """
+        if new:
+            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        elif self.look() is None:
+            raise StorageOutage(f"{self.place}: there is no such folder; mount or make it first")
+        with self.proof.granted(self, installation) if self.proof else nullcontext():
+            yield
+
+    def look(self) -> Hashable:
+        """The folder's place in its file system; None if there is none.
+
+        Raises:
+            StorageOutage: the folder cannot be looked at.
+        """
+        try:
+            found = os.stat(self.folder)
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        except OSError as error:
+            raise self._outage(error) from error
+        return found.st_dev, found.st_ino
+
+    def look_closely(self) -> tuple[Hashable, Marker | None]:
+        """The folder's place in its file system, and the marker there.
+
+        Raises:
+            InputError: the marker cannot be understood.
+            StorageOutage: the folder cannot be read.
+        """
+        try:
+            with opened_folder(self.folder) as folder:
+                found = os.fstat(folder)
+                place = found.st_dev, found.st_ino
+                try:
+                    marker = os.open(MARKER, os.O_RDONLY | os.O_CLOEXEC, dir_fd=folder)
+                except FileNotFoundError:
+                    return place, None
+                with os.fdopen(marker, "rb") as file:
+                    return place, parse_marker(file.read())
+        except (FileNotFoundError, NotADirectoryError):
+            return None, None
+        except OSError as error:
+            raise self._outage(error) from error
+
+    def _outage(self, error: OSError) -> StorageOutage:
+        outage = outage_of(error)
+        reason = "the storage of files cannot be used" if outage is None else outage.reason
+        return StorageOutage(f"{self.place}: {error.strerror or error}", reason)
 
     @contextmanager
     def writing(self, key: str, limit_bytes: int | None = None) -> Iterator[Writing]:
@@ -158,20 +188,21 @@ class Storage:
         Both names share the bytes where the file system has hard links; elsewhere the bytes are copied.
         """
         self._locate(key)
-        with path.open("rb") as file:
-            os.fsync(file.fileno())
-        second_name = self.scratch() / f"link-{uuid4().hex}"
-        try:
+        with self.proven():
+            with path.open("rb") as file:
+                os.fsync(file.fileno())
+            second_name = self.scratch() / f"link-{uuid4().hex}"
             try:
-                os.link(path, second_name)
-            except OSError:
-                shutil.copyfile(path, second_name)
-                with second_name.open("rb") as file:
-                    os.fsync(file.fileno())
-            self._place(second_name, key)
-        finally:
-            # A rename between two names of one file does nothing.
-            second_name.unlink(missing_ok=True)
+                try:
+                    os.link(path, second_name)
+                except OSError:
+                    shutil.copyfile(path, second_name)
+                    with second_name.open("rb") as file:
+                        os.fsync(file.fileno())
+                self._place(second_name, key)
+            finally:
+                # A rename between two names of one file does nothing.
+                second_name.unlink(missing_ok=True)
 
     @property
     def place(self) -> str:
@@ -181,18 +212,40 @@ class Storage:
     def scratch(self) -> Path:
         """A folder for unfinished files, on the file system of the storage if it is a folder.
 
-        Files that stay in it are swept after some hours.
+        Files that stay in it are swept after some hours. Write into it where the storage is `proven`.
+
+        Raises:
+            StorageOutage: there is no such folder, and the storage is not that of its installation.
         """
         folder = self.folder / UNFINISHED
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not folder.is_dir():
+            self.prove()
+            self._make_scratch()
         return folder
+
+    def unfinished(self, prefix: str) -> list[Path]:
+        """The unfinished files whose names begin with a text; none where there is no storage."""
+        return list((self.folder / UNFINISHED).glob(f"{prefix}*"))
+
+    def _make_scratch(self) -> None:
+        """Make the folder for unfinished files in the proven folder, whatever is mounted meanwhile."""
+        if self.proof is None:
+            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with opened_folder(self.folder) as folder:
+            found = os.fstat(folder)
+            if (found.st_dev, found.st_ino) != self.look():
+                raise StorageOutage(f"{self.place}: another folder was mounted meanwhile")
+            self.prove()
+            with suppress(FileExistsError):
+                os.mkdir(UNFINISHED, 0o700, dir_fd=folder)
 
     @contextmanager
     def scratch_folder(self, prefix: str) -> Iterator[Path]:
         """A folder in `scratch` that is deleted at the end of the context, and not swept before."""
         with (
+            self.proven(),
             TemporaryDirectory(prefix=prefix, dir=self.scratch()) as folder,
-            _locked(Path(folder)),
+            locked(Path(folder)),
         ):
             yield Path(folder)
 
@@ -211,7 +264,7 @@ class Storage:
 
     def reader(self, key: str) -> RangeReader:
         """Open a file to read it by position."""
-        return _FileReader(os.open(self.path(key), os.O_RDONLY | os.O_CLOEXEC))
+        return FileReader(os.open(self.path(key), os.O_RDONLY | os.O_CLOEXEC))
 
     def size(self, key: str) -> int:
         """The size of a file, bytes."""
@@ -237,9 +290,11 @@ class Storage:
         Raises:
             InputError: the key is malformed.
             NotFound: there is no such file.
+            StorageOutage: the whole storage is missing, or is another one.
         """
         path = self._locate(key)
         if not path.is_file():
+            self.prove()
             raise NotFound(f"no file {key} in the storage")
         return path
 
@@ -254,7 +309,8 @@ class Storage:
     def delete(self, key: str) -> None:
         """Delete a file, if it exists, and the folders that become empty."""
         path = self._locate(key)
-        path.unlink(missing_ok=True)
+        with self.proven():
+            path.unlink(missing_ok=True)
         with suppress(OSError):
             while (path := path.parent) != self.folder:
                 path.rmdir()
@@ -262,10 +318,11 @@ class Storage:
     def move(self, key: str, new_key: str) -> None:
         """Give a file another key; does nothing if there is no such file."""
         path = self._locate(key)
-        # Another process may move or delete it at the same time.
-        with suppress(FileNotFoundError):
-            self._place(path, new_key)
-        self.delete(key)
+        with self.proven():
+            # Another process may move or delete it at the same time.
+            with suppress(FileNotFoundError):
+                self._place(path, new_key)
+            self.delete(key)
 
     def keys(self, prefix: str) -> list[str]:
         """The keys of all files below a folder of the storage, sorted."""
@@ -293,11 +350,12 @@ class Storage:
             spare: files whose names begin with this text stay.
         """
         swept = []
-        for path in (self.folder / UNFINISHED).glob("*"):
+        for path in self.unfinished(""):
+            self.prove()
             with suppress(FileNotFoundError, BlockingIOError):
                 if time.time() - path.stat().st_mtime < older_than_s or path.name.startswith(spare):
                     continue
-                with _locked(path, fcntl.LOCK_EX | fcntl.LOCK_NB):
+                with locked(path, fcntl.LOCK_EX | fcntl.LOCK_NB):
                     if path.is_dir():
                         shutil.rmtree(path, ignore_errors=True)
                     else:
@@ -308,13 +366,11 @@ class Storage:
     def _place(self, unfinished: Path, key: str) -> None:
         """Move a finished file to its key."""
         path = self._locate(key)
+        self.prove()
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         unfinished.replace(path)
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
+        with opened_folder(path.parent) as folder:
             os.fsync(folder)
-        finally:
-            os.close(folder)
 
     def _locate(self, key: str) -> Path:
         path = self.folder / checked_key(key)
@@ -331,59 +387,21 @@ class Storage:
     @contextmanager
     def _unfinished(self, limit_bytes: int | None) -> Iterator[Writing]:
         """A temporary file on the file system of the storage, so that one rename moves it to its key."""
-        handle, name = mkstemp(dir=self.scratch())
-        try:
-            with os.fdopen(handle, "wb") as file:
-                _lock(file.fileno(), fcntl.LOCK_SH)
-                yield Writing(file, Path(name), limit_bytes)
-        finally:
-            Path(name).unlink(missing_ok=True)
-
-
-@dataclass(frozen=True)
-class _FileReader:
-    descriptor: int
-
-    def read(self, start: int, length: int) -> bytes:
-        return os.pread(self.descriptor, length, start)
-
-    def close(self) -> None:
-        os.close(self.descriptor)
+        with self.proven():
+            handle, name = mkstemp(dir=self.scratch())
+            try:
+                with os.fdopen(handle, "wb") as file:
+                    lock(file.fileno(), fcntl.LOCK_SH)
+                    yield Writing(file, Path(name), limit_bytes)
+            finally:
+                Path(name).unlink(missing_ok=True)
 
 
 @contextmanager
-def _locked(path: Path, mode: int = fcntl.LOCK_SH) -> Iterator[None]:
-    """Lock a file or folder; the kernel releases the lock of a killed process."""
-    descriptor = os.open(path, os.O_RDONLY)
+def opened_folder(path: Path) -> Iterator[int]:
+    """The descriptor of a folder, which stays the same folder whatever is mounted over its path."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        _lock(descriptor, mode)
-        yield
+        yield descriptor
     finally:
         os.close(descriptor)
-
-
-def _lock(descriptor: int, mode: int) -> None:
-    try:
-        fcntl.flock(descriptor, mode)
-    except BlockingIOError:
-        raise
-    except OSError:
-        return  # The file system has no such locks: its files are swept by their age alone.
-
-
-def checked_key(key: str) -> str:
-    """The key, after a check of its form.
-
-    Raises:
-        InputError: the key is malformed.
-    """
-    if not KEY.fullmatch(key) or key.split("/")[0] == UNFINISHED:
-        raise InputError(
-            f"{key!r} is not a key of the storage: expected names of letters, digits, . _ -"
-        )
-    return key
-
-
-def chips_key(sha256: str) -> str:
-    """The key of a chip file: the checksum of its content, so that equal files are stored once."""
-    return f"chips/{sha256}.npy"

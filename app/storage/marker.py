@@ -3,10 +3,13 @@
 import json
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import TYPE_CHECKING
 from uuid import UUID
 
-from app.errors import InputError, NotFound
-from app.storage.folder import Storage
+from app.errors import InputError
+
+if TYPE_CHECKING:
+    from app.storage.folder import Storage
 
 MARKER = "installation.json"
 
@@ -24,17 +27,12 @@ class Marker:
     generation: int
 
 
-def read_marker(storage: Storage) -> Marker | None:
-    """The installation that a storage belongs to; None if the storage does not name one.
+def parse_marker(content: bytes) -> Marker:
+    """The marker in the content of its file.
 
     Raises:
         InputError: the file cannot be understood.
     """
-    try:
-        with storage.open(MARKER) as file:
-            content = file.read()
-    except NotFound:
-        return None
     try:
         fields = json.loads(content)
         return Marker(UUID(fields["installation"]), int(fields["generation"]))
@@ -42,7 +40,17 @@ def read_marker(storage: Storage) -> Marker | None:
         raise InputError(f"{MARKER} of the storage is damaged: no installation can be read") from error
 
 
-def write_marker(storage: Storage, marker: Marker) -> None:
+def read_marker(storage: "Storage") -> Marker | None:
+    """The installation that a storage belongs to; None if the storage does not name one.
+
+    Raises:
+        InputError: the file cannot be understood.
+        StorageOutage: the storage cannot be read.
+    """
+    return storage.look_closely()[1]
+
+
+def write_marker(storage: "Storage", marker: Marker) -> None:
     """Record in a storage which installation it belongs to."""
     fields = {
         "installation": str(marker.installation),

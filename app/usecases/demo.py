@@ -8,7 +8,7 @@ import numpy as np
 
 from app.config import Settings
 from app.db import engine
-from app.storage import open_storage
+from app.usecases import storage_identity
 from app.usecases.blocks import lifecycle
 from app.usecases.image_production import ProductionImages, run_production
 from app.usecases.production import BlockIdentity
@@ -137,8 +137,8 @@ def run_demo(folder: Path, settings: Settings, options: DemoOptions, progress: P
         options.production,
         progress=part_of(progress, 0.3, 0.4),
     )
-    storage = open_storage(settings)
     with engine.opened(settings) as database:
+        storage = storage_identity.opened(database, settings)
         progress(0.7, "ingesting the block")
         with database.transaction() as connection:
             ingested = lifecycle.ingest_block(connection, storage, folder / "block")

@@ -24,10 +24,19 @@ from app.db.jobs.progress import JobMessage, Outlook
 from app.db.scenes import scene_names
 from app.db.schema import JobResponse
 from app.db.tokens import Token
-from app.errors import AmersError, DamagedFile, InputError, NoSuchJob, NoSuchProcess, is_no_memory
+from app.errors import (
+    AmersError,
+    DamagedFile,
+    InputError,
+    NoSuchJob,
+    NoSuchProcess,
+    StorageOutage,
+    is_no_memory,
+    is_no_room,
+)
 from app.outages import outage_of
-from app.storage import Storage, open_storage
-from app.usecases import quotas
+from app.storage import Storage
+from app.usecases import quotas, storage_identity
 from app.usecases.blocks.export import EXPORT_BLOCK
 from app.usecases.blocks.ingestion import INGEST_BLOCK
 from app.usecases.blocks.quality_job import ASSESS_BLOCK
@@ -256,13 +265,14 @@ def do_attempt(database: Database, settings: Settings, job_id: UUID, attempt: in
     Raises:
         MemoryError: a file seemed unusable because there was no memory to read it.
         LostJob: this attempt is no longer the current one; nothing is written.
+        StorageOutage: the storage is away, takes no files, or is not that of the installation.
     """
     with database.transaction() as connection:
         job = jobs.find(connection, job_id)
     if job is None or (job.attempt, job.state) != (attempt, "running"):
         raise LostJob(f"attempt {attempt} of job {job_id} is over")
     process = find_process(job.kind)
-    storage = open_storage(settings)
+    storage = storage_identity.opened(database, settings)
     try:
         inputs = process.parse_inputs(job.inputs)
         progress = _ReportedProgress(database, job)
@@ -271,15 +281,25 @@ def do_attempt(database: Database, settings: Settings, job_id: UUID, attempt: in
             results = commit(connection)
             message = success_message(results)
             attempts.succeed(connection, job.id, attempt, results, message)
+            storage.prove()
         log.info("job %s: %s", job.id, message)
     except AmersError as error:
+        # What cannot be read because the storage is away is no failure of the job.
+        storage.prove()
         if is_no_memory(error):
             raise MemoryError from error
         if isinstance(error, DamagedFile):
             report_damage(database, error)
         _fail(database, storage, job, error)
     except WorkFailed as failure:
+        storage.prove()
         _fail(database, storage, job, failure.error, failure.results)
+    except (LostJob, StorageOutage):
+        raise
+    except Exception as error:
+        if not is_no_memory(error) and not is_no_room(error):
+            storage_identity.require_writable(storage)
+        raise
 
 
 def _fail(

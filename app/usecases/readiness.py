@@ -1,20 +1,24 @@
 """Readiness: what of an installation works, by part, checked at most every few seconds."""
 
+import os
 import shutil
 import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as TooSlow
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import psycopg
 
+from app import reserve
 from app.config import Settings
 from app.db import checks, engine, revisions
 from app.db.engine import Connection
 from app.db.jobs import progress
-from app.errors import NotFound, StorageOutage
+from app.errors import StorageOutage
 from app.outages import NO_ANSWER, outage_of
 from app.usecases import storage_identity
 from app.usecases.installation import Installation
@@ -24,8 +28,7 @@ VALID_S = 2.0
 """A result is repeated for this time, so that frequent probes cost nothing."""
 STORAGE_LIMIT_S = 5.0
 """A storage that takes longer to write and read a tiny file does not answer."""
-PROBE = "probe.txt"
-"""Key of the tiny file; top-level keys belong to no block, scene or job."""
+PROBE = storage_identity.PROBE
 SILENT_SHARE = 0.1
 """Share of the time limit of a job for which its process may report nothing."""
 STILL_LEASES = 3
@@ -164,26 +167,63 @@ def _storage(installation: Installation) -> Part:
             reason = storage_identity.mismatch(connection, storage)
     except psycopg.Error:
         return Part("failed", "it is not known whether the storage belongs to the database")
-    except (StorageOutage, OSError):
-        return Part("failed", "the storage does not answer")
+    except (StorageOutage, OSError) as error:
+        outage = outage_of(error)
+        return Part("failed", "the storage does not answer" if outage is None else outage.reason)
     if reason is not None:
         return Part("failed", reason)
     try:
-        storage.put(PROBE, [PROBE.encode()])
-        with storage.open(PROBE) as file:
-            file.read()
-    except (StorageOutage, OSError, NotFound):
-        return Part("degraded", "no file can be written into the storage: uploads and jobs fail")
+        storage_identity.require_writable(storage)
+    except StorageOutage as outage:
+        return Part(
+            "degraded",
+            f"no file can be written into the storage: uploads and jobs wait; {outage.reason}",
+        )
+    reserve.keep(installation.settings)
     return OK
 
 
 def _disk(installation: Installation) -> Part:
+    """Each disk that Amers writes to takes files and has room."""
     settings = installation.settings
-    free_bytes = shutil.disk_usage(existing_folder(settings.data_folder)).free
-    if free_bytes >= settings.min_free_bytes:
-        return OK
-    return Part(
-        "degraded",
-        f"{free_bytes} bytes are free on the disk of the data folder, fewer than AMERS_MIN_FREE_BYTES "
-        f"({settings.min_free_bytes})",
+    reasons = [
+        reason
+        for name, folder in _disks(settings).items()
+        if (reason := _trouble(name, folder, settings.min_free_bytes)) is not None
+    ]
+    return Part("degraded", "; ".join(reasons)) if reasons else OK
+
+
+def _disks(settings: Settings) -> dict[str, Path]:
+    """The folders that lie on disks of their own, by their names."""
+    folders = {"the data folder": existing_folder(settings.data_folder)}
+    if settings.storage_url is None:
+        folders["the storage"] = settings.data_folder / "storage"
+    if settings.database_url is None:
+        folders["the private database"] = settings.data_folder / "postgres"
+    disks: dict[str, Path] = {}
+    seen = set()
+    for name, folder in folders.items():
+        # A storage that is away is told of by its own part.
+        with suppress(OSError):
+            if (disk := folder.stat().st_dev) not in seen:
+                disks[name] = folder
+                seen.add(disk)
+    return disks
+
+
+def _trouble(name: str, folder: Path, least_bytes: int) -> str | None:
+    """Why a disk takes no files, or soon will not."""
+    try:
+        free_bytes = shutil.disk_usage(folder).free
+        is_read_only = bool(os.statvfs(folder).f_flag & os.ST_RDONLY)
+    except OSError as error:
+        return f"the disk of {name} cannot be looked at: {error.strerror}"
+    if is_read_only:
+        return f"the disk of {name} is mounted read-only: nothing can be stored there"
+    if free_bytes >= least_bytes:
+        return None
+    return (
+        f"{free_bytes} bytes are free on the disk of {name}, fewer than AMERS_MIN_FREE_BYTES "
+        f"({least_bytes}): delete something, which works on a full disk too"
     )

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from app.db import stored_files
 from app.db.engine import Database
 from app.db.jobs import attempts, jobs
 from app.db.jobs.jobs import Job
-from app.errors import NotFound
+from app.errors import NotFound, StorageOutage
 from app.storage import Storage
 from app.usecases import quotas
 from app.usecases.damage import named_by_row
@@ -22,6 +23,8 @@ from app.usecases.processes import Work, results_folder
 Transmission = Literal["value", "reference"]
 LARGEST_VALUE_BYTES = 16 << 20
 """A larger file is sent by reference even if requested by value, unless it is the only raw output."""
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,14 @@ def delete_files(storage: Storage, folder: str) -> None:
     """Delete the files below a folder of the storage."""
     for key in storage.keys(folder):
         storage.delete(key)
+
+
+def delete_removed(storage: Storage, folder: str) -> None:
+    """Delete the files below a folder that no row names any more; the sweep removes what is left."""
+    try:
+        delete_files(storage, folder)
+    except (StorageOutage, OSError) as outage:
+        log.warning("%s: the sweep has to delete its files: %s", folder, outage)
 
 
 def requested_results(storage: Storage, job: Job) -> tuple[dict[str, Any], list[ResultFile]]:

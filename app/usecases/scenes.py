@@ -1,5 +1,6 @@
 """Upload, list and remove scenes, and the files beside their images."""
 
+import logging
 import re
 import unicodedata
 from collections.abc import Iterable, Iterator
@@ -39,6 +40,8 @@ SIDE_FILE_LIMIT_BYTES = 16 << 20
 MOST_SIDE_FILES = 100
 """Largest number of files beside one image."""
 
+log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class SentFile:
@@ -70,6 +73,7 @@ def upload_scene(
         sigma_m: accuracy of the scene's model as the sender states it, metres.
 
     Raises:
+        StorageOutage: the storage is away, or is not that of the installation.
         TooLarge: the image exceeds the limit or the owner's quota.
         FormatError: the first bytes are not those of a TIFF, JPEG 2000 or NITF file.
         InputError: the name cannot be used, or size or checksum are not as announced.
@@ -77,6 +81,7 @@ def upload_scene(
     database, storage = installation.database, installation.storage
     limit = installation.settings.upload_limit_bytes
     file_name = clean_name(sent.name)
+    storage.prove()
     _refuse_too_large(sent, limit)
     with database.transaction() as connection:
         left = quotas.require_room(
@@ -131,6 +136,7 @@ def upload_side_file(
         TooMany: the scene has as many files as are allowed.
     """
     database, settings = installation.database, installation.settings
+    installation.storage.prove()
     with database.transaction() as connection:
         scene = visible_scene(connection, caller, scene_id)
         file_name = side_file_name(scene, sent.name)
@@ -338,9 +344,12 @@ def remove_scene(connection: Connection, caller: Token, scene_id: UUID) -> None:
 
 
 def delete_files(storage: Storage, scene_id: UUID) -> None:
-    """Delete the files of a removed scene."""
-    for key in storage.keys(folder_of(scene_id)):
-        storage.delete(key)
+    """Delete the files of a removed scene; what an outage leaves is removed by the sweep."""
+    try:
+        for key in storage.keys(folder_of(scene_id)):
+            storage.delete(key)
+    except (StorageOutage, OSError) as outage:
+        log.warning("scene %s: the sweep has to delete its files: %s", scene_id, outage)
 
 
 def folder_of(scene_id: UUID) -> str:

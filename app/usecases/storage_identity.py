@@ -1,4 +1,4 @@
-"""The storage belongs to its database: each names the other, and only then files are removed.
+"""The storage belongs to its database: each names the other, and only then files are written or removed.
 
 The storage names its installation in the file `installation.json`. A number in it, the generation,
 advances in database and storage while the service runs. A database whose generation is behind was
@@ -12,12 +12,13 @@ from functools import partial
 
 import psycopg
 
+from app.config import Settings
 from app.db import installation, uploads
 from app.db.engine import Connection, Database
 from app.db.installation import InstallationRow
-from app.errors import Conflict, InputError, StorageOutage
+from app.errors import Conflict, InputError, NotFound, StorageOutage
 from app.outages import outage_of
-from app.storage import Marker, Storage, read_marker, write_marker
+from app.storage import Marker, Storage, open_storage, read_marker, write_marker
 from app.usecases import garbage_collection
 from app.usecases.uploads import arriving_files
 
@@ -29,6 +30,8 @@ UNNAMED = (
     "the storage names no installation: it is not mounted, it is another one, or the database does not "
     "know its files"
 )
+PROBE = "probe.txt"
+"""Key of the tiny file that tries a storage; top-level keys belong to no block, scene or job."""
 KNOWN_SHARE = 0.95
 """A storage of an earlier version is adopted if rows of the database name this share of its files."""
 ADVICE = (
@@ -53,9 +56,50 @@ def require_match(database: Database, storage: Storage) -> None:
         Conflict: it does not.
     """
     with database.reading() as connection:
+        expect(connection, storage)
         reason = mismatch(connection, storage)
     if reason is not None:
         raise Conflict(reason)
+
+
+def expect(connection: Connection, storage: Storage) -> InstallationRow:
+    """Tell a storage the installation whose marker each write needs; returns its identity."""
+    row = installation.read(connection)
+    if storage.proof is not None:
+        storage.proof.bind(row.id)
+    return row
+
+
+def opened(database: Database, settings: Settings) -> Storage:
+    """The storage of an installation, for a process that does one thing with it.
+
+    The first process of a new installation prepares its storage.
+
+    Raises:
+        InputError: `storage_url` names a bucket that cannot be used.
+    """
+    storage = open_storage(settings)
+    with database.reading() as connection:
+        row = expect(connection, storage)
+    if row.storage_generation == 0:
+        announce(database.transaction, storage)
+    return storage
+
+
+def require_writable(storage: Storage) -> None:
+    """Check that a storage takes files: a tiny one is written and read.
+
+    Raises:
+        StorageOutage: it does not; the reason is for callers.
+    """
+    try:
+        storage.put(PROBE, [PROBE.encode()])
+        with storage.open(PROBE) as file:
+            file.read()
+    except (OSError, NotFound) as error:
+        outage = outage_of(error)
+        reason = "no file can be written into the storage" if outage is None else outage.reason
+        raise StorageOutage(f"{storage.place}: no file can be written: {error}", reason) from error
 
 
 def prepare(begin: Begin, storage: Storage) -> str | None:
@@ -69,8 +113,10 @@ def prepare(begin: Begin, storage: Storage) -> str | None:
         reason = _compare(storage, row, partial(_without_marker, connection, storage, row))
         if reason is not None:
             return reason
+        expect(connection, storage)
         if row.storage_generation == 0:
-            write_marker(storage, Marker(row.id, 0))
+            with storage.found(row.id):
+                write_marker(storage, Marker(row.id, 0))
         installation.advance(connection)
     _write_marker(begin, storage)
     return None
@@ -79,6 +125,7 @@ def prepare(begin: Begin, storage: Storage) -> str | None:
 def advance(begin: Begin, storage: Storage) -> None:
     """Advance the generation of a storage and its database, if they belong together."""
     with begin() as connection:
+        expect(connection, storage)
         if _compare(storage, installation.lock(connection), lambda: UNNAMED) is not None:
             return
         installation.advance(connection)
@@ -88,25 +135,34 @@ def advance(begin: Begin, storage: Storage) -> None:
 def announce(begin: Begin, storage: Storage) -> bool:
     """Prepare the storage and log what stands against it; returns whether it belongs to the database."""
     try:
+        with begin() as connection:
+            expect(connection, storage)
         reason = prepare(begin, storage)
-    except (StorageOutage, OSError, psycopg.Error) as error:
-        outage = outage_of(error)
-        if outage is None and isinstance(error, psycopg.Error):
+    except (StorageOutage, OSError) as error:
+        reason = f"the storage could not be checked: {error}"
+    except psycopg.Error as error:
+        if (outage := outage_of(error)) is None:
             raise
-        reason = f"the storage could not be checked: {outage.reason if outage else error}"
+        reason = f"the storage could not be checked: {outage.reason}"
     if reason is not None:
         log.error("%s: %s", storage.place, reason)
     return reason is None
 
 
 def adopt(begin: Begin, storage: Storage) -> InstallationRow:
-    """Bind a storage to the database, whatever it belonged to; returns their identity."""
+    """Bind a storage to the database, whatever it belonged to; returns their identity.
+
+    Raises:
+        StorageOutage: there is no such folder; none is made.
+    """
     with begin() as connection:
-        installation.lock(connection)
+        row = installation.lock(connection)
         try:
             marker = read_marker(storage)
         except InputError:
             marker = None
+        with storage.found(row.id, new=row.storage_generation == 0):
+            write_marker(storage, Marker(row.id, 0))
         installation.advance(connection, beyond=marker.generation if marker else 0)
     return _write_marker(begin, storage)
 

@@ -147,7 +147,8 @@ def create_upload(
         metadata=new.metadata,
     )
     upload = uploads.insert_upload(connection, announced)
-    _path(storage, upload.id).touch(mode=0o600, exist_ok=False)
+    with storage.proven():
+        _path(storage, upload.id).touch(mode=0o600, exist_ok=False)
     return upload
 
 
@@ -173,7 +174,8 @@ def received_bytes(storage: Storage, upload: UploadRow) -> int:
     if upload.finished_at is not None:
         return upload.size_bytes
     try:
-        return _path(storage, upload.id).stat().st_size
+        with storage.proven():
+            return _path(storage, upload.id).stat().st_size
     except FileNotFoundError:
         raise _missing_file(upload.id) from None
 
@@ -196,14 +198,15 @@ def append_piece(installation: Installation, upload: UploadRow, piece: Piece) ->
         InputError: the complete file cannot be used; it is deleted.
     """
     path = _path(installation.storage, upload.id)
-    with _locked(path, upload.id) as file:
+    with installation.storage.proven(), _locked(path, upload.id) as file:
         received = file.seek(0, os.SEEK_END)
         if piece.start != received:
             raise Conflict(
                 f"the piece starts at byte {piece.start}, but {received} bytes have arrived; "
                 f"continue from byte {received}"
             )
-        _append(file, piece, upload.size_bytes)
+        with installation.storage.proven():
+            _append(file, piece, upload.size_bytes)
         received = file.tell()
         with installation.database.transaction() as connection:
             if uploads.prolong(connection, upload.id) is None:
@@ -222,7 +225,8 @@ def terminate_upload(connection: Connection, storage: Storage, upload: UploadRow
     if upload.finished_at is not None:
         raise Conflict(f"upload {upload.id} is complete: remove its scene instead")
     _delete_row(connection, upload)
-    _path(storage, upload.id).unlink(missing_ok=True)
+    with storage.proven():
+        _path(storage, upload.id).unlink(missing_ok=True)
 
 
 def remove_abandoned_uploads(database: Database, storage: Storage) -> list[str]:
@@ -236,14 +240,15 @@ def remove_abandoned_uploads(database: Database, storage: Storage) -> list[str]:
     with database.transaction() as connection:
         arriving = uploads.arriving(connection, list(files))
     abandoned = [path for upload_id, path in files.items() if upload_id not in arriving]
-    for path in abandoned:
-        path.unlink(missing_ok=True)
+    with storage.proven():
+        for path in abandoned:
+            path.unlink(missing_ok=True)
     return [path.name for path in abandoned]
 
 
 def arriving_files(storage: Storage) -> dict[UUID, Path]:
     """The files of incomplete uploads on this machine, by the ids of their uploads."""
-    paths = storage.scratch().glob(f"{UPLOAD_PREFIX}*")
+    paths = storage.unfinished(UPLOAD_PREFIX)
     return {UUID(path.name.removeprefix(UPLOAD_PREFIX)): path for path in paths}
 
 

@@ -81,7 +81,12 @@ def read_unowned(connection: Connection, storage: Storage) -> list[UnownedFiles]
     stored = {name: storage.sizes(name) for name in ("chips", "scenes", "results", "uploads", TRASH)}
     size_of = {key: size for sizes in stored.values() for key, size in sizes.items()}
     chips = stored["chips"].keys() - set(without_row)
-    unfinished = [path.stat().st_size for path in storage.scratch().rglob("*") if path.is_file()]
+    unfinished = [
+        path.stat().st_size
+        for top in storage.unfinished("")
+        for path in (top, *top.rglob("*"))
+        if path.is_file()
+    ]
     return [
         UnownedFiles("chips of blocks", len(chips), sum(size_of[key] for key in chips)),
         UnownedFiles("trash", len(stored[TRASH]), sum(stored[TRASH].values())),

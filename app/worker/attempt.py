@@ -10,6 +10,7 @@ import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import psycopg
@@ -23,8 +24,8 @@ from app.db.jobs.jobs import Job
 from app.errors import StorageOutage, is_no_room
 from app.outages import outage_of
 from app.request_context import Origin, working_for
-from app.storage import Storage, open_storage
-from app.usecases import results
+from app.storage import Storage
+from app.usecases import results, storage_identity
 from app.worker.warm_process import WarmProcess, WarmServer
 
 FAILURES_ALLOWED = 3
@@ -36,6 +37,8 @@ OUT_OF_MEMORY = 77
 """Exit code of a process that reached its memory limit."""
 NO_ROOM = 78
 """Exit code of a process that found a disk full."""
+STORAGE_AWAY = 79
+"""Exit code of a process whose storage is not mounted, is another one or takes no files."""
 
 log = logging.getLogger(__name__)
 
@@ -75,6 +78,12 @@ class Attempts:
         with self.database.transaction() as connection:
             # The sweep of a worker that fits the database queues the ticket again.
             revisions.require_current(driver(connection))
+            try:
+                self._storage.prove()
+            except StorageOutage as outage:
+                # The sweep queues the ticket again.
+                log.warning("no job is claimed: %s", outage)
+                return
             job = attempts.claim_next(
                 connection,
                 self.worker,
@@ -86,6 +95,11 @@ class Attempts:
         with working_for(Origin(actor_name=f"worker {self.worker}", job_id=job.id)):
             self._do_job(job)
 
+    @cached_property
+    def _storage(self) -> Storage:
+        """The storage of the installation, which this worker writes into while it proves to be that."""
+        return storage_identity.opened(self.database, self.settings)
+
     def _do_job(self, job: Job) -> None:
         log.info("job %s: attempt %d at %s", job.id, job.attempt, job.kind)
         try:
@@ -93,8 +107,8 @@ class Attempts:
         except LostJob as lost:
             log.info("%s", lost)
         try:
-            results.discard_attempt(self.database, open_storage(self.settings), job.id, job.attempt)
-        except (psycopg.Error, StorageOutage) as error:
+            results.discard_attempt(self.database, self._storage, job.id, job.attempt)
+        except (psycopg.Error, StorageOutage, OSError) as error:
             if (outage := outage_of(error)) is None:
                 raise
             log.warning(
@@ -116,10 +130,14 @@ class Attempts:
                 f"the job was stopped after {self.settings.job_seconds:g} s, the limit of this service "
                 "(AMERS_JOB_SECONDS)",
             )
+        except StorageOutage as outage:
+            log.warning("job %s: %s", job.id, outage)
+            self._settle(job, STORAGE_AWAY)
         except OSError as error:
-            if not is_no_room(error):
+            if outage_of(error) is None:
                 raise
-            self._settle(job, NO_ROOM)
+            log.warning("job %s: %s", job.id, error)
+            self._settle(job, NO_ROOM if is_no_room(error) else STORAGE_AWAY)
         else:
             self._settle(job, code)
 
@@ -129,7 +147,12 @@ class Attempts:
             return
         log.error("job %s: attempt %d ended with exit code %d", job.id, job.attempt, code)
         failures = job.failures + 1
-        if code == OUT_OF_MEMORY:
+        if code == STORAGE_AWAY:
+            with self.database.transaction() as connection:
+                attempts.try_again(
+                    connection, job.id, job.attempt, self.settings.lease_seconds, counts=False
+                )
+        elif code == OUT_OF_MEMORY:
             limit = f"{self.settings.job_memory_bytes / 2**20:.0f} MiB"
             self._fail(
                 job,
@@ -171,8 +194,7 @@ class Attempts:
             Stopped, TooLong, LostJob
         """
         arguments = (job.id, job.attempt, os.getpid(), self.settings.job_memory_bytes)
-        storage = Storage(self.settings.data_folder / "storage")
-        with storage.scratch_folder(f"job-{job.id}-") as folder:
+        with self._storage.scratch_folder(f"job-{job.id}-") as folder:
             process = self.processes.start(
                 "app.worker.run:main", [str(value) for value in arguments], {"TMPDIR": str(folder)}
             )

@@ -30,7 +30,7 @@ LONGEST_POLL_S = 5.0
 """Longest time until a delayed ticket is found; new tickets notify the workers."""
 PAUSE_S = 2.0
 """Pause before the queue is read again after an outage of the database."""
-STORAGE_RETRY_S = 60.0
+STORAGE_RETRY_S = 10.0
 """Pause before a worker without jobs looks again whether the storage belongs to the database."""
 ENDING_S = 60.0
 """A worker that is still there so long after its signal ends at once, whatever its threads wait for."""

@@ -2,8 +2,9 @@
 
 Forked by the server of warm processes, with the arguments JOB ATTEMPT WORKER MEMORY_BYTES.
 
-Exit codes: 0 the outcome is written or no longer needed, 77 out of memory, 78 a disk is full, others for
-a crash or an outage. SIGXFSZ ends a process that writes too large a file.
+Exit codes: 0 the outcome is written or no longer needed, 77 out of memory, 78 a disk is full, 79 the
+storage is away, others for a crash or another outage. SIGXFSZ ends a process that writes too large a
+file.
 """
 
 import logging
@@ -13,10 +14,10 @@ from app import logs
 from app.config import read_settings
 from app.db.engine import pooled
 from app.db.jobs.attempts import LostJob
-from app.errors import is_no_memory, is_no_room
+from app.errors import StorageOutage, is_no_memory, is_no_room
 from app.request_context import Origin, working_for
 from app.usecases.jobs import do_attempt
-from app.worker.attempt import NO_ROOM, OUT_OF_MEMORY
+from app.worker.attempt import NO_ROOM, OUT_OF_MEMORY, STORAGE_AWAY
 from app.worker.warm_server import limit_files, limit_memory
 
 log = logging.getLogger(__name__)
@@ -41,6 +42,9 @@ def main(arguments: list[str]) -> int:
             do_attempt(database, settings, UUID(job_id), int(attempt))
     except LostJob as lost:
         log.info("%s", lost)
+    except StorageOutage as outage:
+        log.warning("%s", outage)
+        return STORAGE_AWAY
     except Exception as error:
         if is_no_memory(error):
             return OUT_OF_MEMORY

@@ -7,12 +7,15 @@ all workers may be busy for an hour.
 import logging
 import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 
+from app import reserve
 from app.config import TRASH_DAYS, Settings
 from app.db import scenes, uptime
 from app.db.engine import Database, limit_lock_wait
 from app.db.jobs import attempts, queue
+from app.errors import StorageOutage
 from app.outages import outage_of
 from app.storage import Storage, trash
 from app.usecases import garbage_collection, results, retention, storage_identity
@@ -63,20 +66,26 @@ class Sweeper:
                 if time.monotonic() > next_generation_at:
                     next_generation_at += GENERATION_EVERY_S
                     storage_identity.advance(self.database.transaction, self.storage)
+                    self._keep_reserve()
                 if time.monotonic() > next_files_at:
                     next_files_at += FILES_EVERY_S
-                    sweep_records(self.database, self.storage, self.settings)
-                    sweep_files(
-                        self.database,
-                        self.storage,
-                        self.settings.job_seconds,
-                        self.settings.trash_days,
-                    )
+                    reserve.deleting(self.settings, self._sweep)
             except Exception as error:
                 if (outage := outage_of(error)) is None:
                     log.exception("the sweep failed and is repeated")
                 else:
                     log.warning("the sweep failed and is repeated: %s", outage.reason)
+
+    def _sweep(self) -> None:
+        """Remove old records, and files without rows."""
+        sweep_records(self.database, self.storage, self.settings)
+        sweep_files(self.database, self.storage, self.settings.job_seconds, self.settings.trash_days)
+
+    def _keep_reserve(self) -> None:
+        """Make the reserve for deletions, if it is missing and the storage is mounted."""
+        with suppress(StorageOutage):
+            self.storage.prove()
+            reserve.keep(self.settings)
 
 
 def sweep_jobs(database: Database, lease_s: float, running_limit: int | None = None) -> None:

@@ -1,8 +1,6 @@
 """Disks that fill up during an upload or an ingestion: a clear error and no partial data."""
 
-import os
 import shutil
-import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -19,6 +17,7 @@ from app.storage import Storage
 from app.usecases.blocks import lifecycle
 from app.usecases.garbage_collection import Bin, remove_unnamed_chips
 from tests.app.conftest import stored_files
+from tests.app.small_disk import Disk
 from tests.app.worker_processes import ended, running_worker
 from tests.factories import make_block
 from tests.statements import run_sql
@@ -34,29 +33,6 @@ DATABASE_ROOM = 300 * MEBIBYTE
 """Enough for a database, its log and a block, and little more."""
 
 Bearer = Callable[[str], dict[str, str]]
-
-
-class Disk:
-    """A file system in memory of a given size; tests are skipped where none can be mounted."""
-
-    def __init__(self, folder: Path, size_bytes: int) -> None:
-        if os.geteuid() != 0:
-            pytest.skip("only root can mount a small disk to fill")
-        self.folder = folder
-        folder.mkdir(mode=0o755)
-        self._mount(f"size={size_bytes}", "-t", "tmpfs")
-
-    def grow(self, size_bytes: int) -> None:
-        self._mount(f"remount,size={size_bytes}")
-
-    def remove(self) -> None:
-        subprocess.run(["umount", "--lazy", str(self.folder)], check=True)
-
-    def _mount(self, options: str, *more: str) -> None:
-        command = ["mount", *more, "-o", options, "amers-test", str(self.folder)]
-        result = subprocess.run(command, capture_output=True, text=True, check=False)
-        if result.returncode != 0:
-            pytest.skip(f"no file system can be mounted here: {result.stderr.strip()}")
 
 
 @pytest.fixture

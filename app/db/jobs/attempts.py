@@ -188,8 +188,13 @@ def give_back(connection: Connection, job_id: UUID, attempt: int) -> None:
     issue_ticket(connection)
 
 
-def try_again(connection: Connection, job_id: UUID, attempt: int, delay_s: float) -> None:
+def try_again(
+    connection: Connection, job_id: UUID, attempt: int, delay_s: float, *, counts: bool = True
+) -> None:
     """Return a job whose attempt ended without an outcome, for another attempt after a delay.
+
+    Args:
+        counts: whether the attempt counts as one of the failures that end a job.
 
     Raises:
         LostJob: the attempt is over.
@@ -199,11 +204,11 @@ def try_again(connection: Connection, job_id: UUID, attempt: int, delay_s: float
         job_id,
         attempt,
         state="accepted",
-        failures=job.c.failures + 1,
+        failures=job.c.failures + int(counts),
         lease_until=None,
         not_before=clock + timedelta(seconds=delay_s),
         worker=None,
-        message="broke off, waiting for the next attempt",
+        message="broke off, waiting for the next attempt" if counts else "waiting for the storage",
     )
     issue_ticket(connection, connection.scalar(select(job.c.not_before).where(job.c.id == job_id)))
     replace_spent_ticket(connection)

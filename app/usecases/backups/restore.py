@@ -48,12 +48,13 @@ def restore_backup(
     has_database = is_continued and _is_restored(dsn, manifest)
     if not has_database:
         archive.check_restorable(dsn, folder / ARCHIVE)
-    storage.put(RESTORING, [backup.encode()])
+    with storage.found(manifest.installation):
+        storage.put(RESTORING, [backup.encode()])
+        write_marker(storage, Marker(manifest.installation, manifest.generation))
     stored = [file for file in manifest.files if file.path.startswith(f"{STORAGE}/")]
     for number, file in enumerate(stored):
         progress(0.3 + 0.6 * number / len(stored), file.path)
         _restore_file(storage, folder, file)
-    write_marker(storage, Marker(manifest.installation, manifest.generation))
     progress(0.9, "the database")
     if not has_database:
         archive.restore(dsn, folder / ARCHIVE)

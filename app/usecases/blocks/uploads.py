@@ -27,6 +27,7 @@ def receive_block(installation: Installation, caller: Token, sent: SentFile) -> 
     """
     database, storage = installation.database, installation.storage
     file_name = clean_name(sent.name)
+    storage.prove()
     with database.transaction() as connection:
         left = quotas.require_room(
             connection, installation.settings, caller.id, "the archive", sent.size_bytes
