@@ -289,7 +289,8 @@ def _check(
         if line.poll(0):
             connection.execute("")
             connection.rollback()
-    except psycopg.OperationalError as error:
+    except psycopg.Error as error:
+        # Of whatever kind: the driver may take the last words of a session for a second result.
         raise exc.InvalidatePoolError() from error
 
 

@@ -22,7 +22,7 @@ from psycopg.conninfo import conninfo_to_dict, make_conninfo
 from psycopg.pq import ExecStatus
 from psycopg.pq.abc import PGconn, PGresult
 
-from app.outages import POOLER
+from app.outages import POOLER, outage_of
 
 DriverConnection = psycopg.Connection[tuple[Any, ...]]
 
@@ -194,6 +194,10 @@ def _require_own_session(pgconn: PGconn, dsn: str) -> None:
             theirs = _ask(other.pgconn, WHICH)
         except psycopg.errors.ConnectionTimeout as error:
             raise UnusableSession(TOO_FEW) from error
+        except psycopg.OperationalError as error:
+            if outage_of(error) is POOLER:
+                raise UnusableSession(POOLER.reason) from error
+            raise
         if theirs == mine or _ask(pgconn, WHICH) != mine:
             raise UnusableSession(POOLER.reason)
         _ask(other.pgconn, b"rollback")

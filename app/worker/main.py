@@ -138,7 +138,13 @@ class _Worker:
 
         @app.task(name=queue.TASK, queue=queue.QUEUE)
         def do_next_job() -> None:
-            attempts.do_next_job()
+            try:
+                attempts.do_next_job()
+            except Exception as error:
+                if (outage := outage_of(error)) is None:
+                    raise
+                # The sweep takes the job back and calls a worker again.
+                log.warning("a job was left alone: %s", outage.reason)
 
         async with app.open_async():
             log.info("worker %s waits for jobs", self.name)
