@@ -2,10 +2,13 @@
 
 import re
 from collections.abc import Iterator
+from typing import Any
 
 import httpx
 import pytest
 
+from app.db.features import pages
+from app.usecases.features import items
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.http_world import FORMATS, SITE, TIFF, TUS, HttpWorld, headers_of, http_world
 
@@ -43,6 +46,27 @@ def test_head_of_every_format_has_the_headers_of_its_page(world: HttpWorld):
     for name in FORMATS:
         head = like_get(world, f"/collections/points/items?f={name}&limit=5")
         assert int(head.headers["content-length"]) > 0
+
+
+def test_head_of_a_large_page_does_not_read_it(world: HttpWorld, monkeypatch: pytest.MonkeyPatch):
+    read, stream = [], items.stream
+
+    def counted(*arguments: Any) -> Iterator[Any]:
+        for piece in stream(*arguments):
+            read.append(piece)
+            yield piece
+
+    monkeypatch.setattr(items, "stream", counted)
+    monkeypatch.setattr(pages, "ROWS_AT_ONCE", 3)
+    url, turns = "/collections/points/items?limit=10000", world.app.state.turns
+    whole = world.client.get(url)
+    assert (len(whole.json()["features"]), len(read)) == (30, 11)
+    read.clear()
+    for _ in range(2 * turns.most):
+        head = world.client.head(url)
+        assert (head.status_code, headers_of(head)) == (200, headers_of(whole))
+    assert len(read) == 3 * 2 * turns.most
+    assert turns.free == turns.most, "each has given up its connection"
 
 
 def test_every_path_tells_its_methods(world: HttpWorld):
