@@ -32,6 +32,11 @@ def check_outcome(dsn: str, installation: KilledInstallation, caller: Caller) ->
                 connection,
                 "update scene set created_at = created_at - interval '2 days' where state = 'uploading'",
             )
+            run_sql(
+                connection,
+                "update upload set expires_at = expires_at - interval '2 days'"
+                " where finished_at is null",
+            )
             run_sql(connection, "update uptime set elapsed_s = elapsed_s + 2 * 86400")
         sweep_files(database, storage, settings.job_seconds)
         storage.sweep_unfinished(0.0, spare="upload-")
