@@ -4,7 +4,8 @@ import json
 import logging
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from tempfile import gettempdir
@@ -21,11 +22,12 @@ from app.db.jobs import progress as job_progress
 from app.db.jobs.attempts import LostJob
 from app.db.jobs.jobs import Job, JobFilter
 from app.db.jobs.progress import JobMessage, Outlook
-from app.db.scenes import scene_names
+from app.db.scenes import keeping_files, scene_names
 from app.db.schema import JobResponse
 from app.db.tokens import Token
 from app.errors import (
     AmersError,
+    Conflict,
     DamagedFile,
     InputError,
     NoSuchJob,
@@ -276,7 +278,8 @@ def do_attempt(database: Database, settings: Settings, job_id: UUID, attempt: in
     try:
         inputs = process.parse_inputs(job.inputs)
         progress = _ReportedProgress(database, job)
-        commit = process.run(Work(job, inputs, database, storage, settings, progress))
+        with _noticing_removal(database, job):
+            commit = process.run(Work(job, inputs, database, storage, settings, progress))
         with database.transaction() as connection:
             results = commit(connection)
             message = success_message(results)
@@ -300,6 +303,30 @@ def do_attempt(database: Database, settings: Settings, job_id: UUID, attempt: in
         if not is_no_memory(error) and not is_no_room(error):
             storage_identity.require_writable(storage)
         raise
+
+
+@contextmanager
+def _noticing_removal(database: Database, job: Job) -> Iterator[None]:
+    """Name the scene that its owner removed while a job read its files, whatever broke by that.
+
+    Raises:
+        Conflict: a scene of the inputs was removed.
+    """
+    try:
+        yield
+    except (LostJob, MemoryError, StorageOutage):
+        raise
+    except Exception as error:
+        named = [job.inputs.get("scene"), *(job.inputs.get("scenes") or ())]
+        ids = [UUID(scene) for scene in named if scene]
+        with database.reading() as connection:
+            kept = keeping_files(connection, ids)
+        removed = [scene for scene in ids if not kept.get(scene, False)]
+        if not removed or is_no_memory(error):
+            raise
+        raise Conflict(
+            f"scene {removed[0]} was removed while this job used it; upload it again"
+        ) from error
 
 
 def _fail(
