@@ -80,6 +80,7 @@ class Settings(BaseSettings):
         quota_storage_bytes: largest total size of all that one token has in the storage.
         quota_open_uploads: largest number of resumable uploads of one token that are not complete.
         quota_jobs: largest number of open jobs of one token.
+        quota_cpu_seconds: CPU that the jobs of one token may take in a day.
         jobs_running_per_owner: largest number of running jobs of one token; None: no limit.
         quota_kept_jobs: largest number of jobs of one token, those that have ended included.
         public_metrics: whether metrics can be read without a token.
@@ -134,6 +135,7 @@ class Settings(BaseSettings):
     quota_storage_bytes: int = Field(default=1024 * GIBIBYTE, ge=0)
     quota_open_uploads: int = Field(default=100, ge=0)
     quota_jobs: int = Field(default=100, ge=0)
+    quota_cpu_seconds: float = Field(default=864_000.0, gt=0)
     jobs_running_per_owner: int | None = Field(default=None, ge=1)
     quota_kept_jobs: int = Field(default=10_000, ge=0)
     public_metrics: bool = False

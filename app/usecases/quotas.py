@@ -81,7 +81,8 @@ def require_free_job(connection: Connection, settings: Settings, caller: Token) 
     """Refuse a new job to a token whose open jobs or kept jobs reach their quota; locks the token.
 
     Raises:
-        TooMany: the token has as many open jobs, or as many jobs in all, as its quota allows.
+        TooMany: the token has as many open jobs, or as many jobs in all, as its quota allows, or its
+            jobs have taken the CPU of a day.
     """
     quota = caller.job_quota
     allowed = settings.quota_jobs if quota is None else quota
@@ -91,6 +92,14 @@ def require_free_job(connection: Connection, settings: Settings, caller: Token) 
         raise TooMany(
             f"token {caller.name} has {open_jobs} open jobs of {allowed} allowed; "
             "wait until one has ended, or dismiss one"
+        )
+    daily_s = settings.quota_cpu_seconds
+    taken_s = attempts.cpu_taken(connection, caller.id, daily_s)
+    if taken_s >= daily_s:
+        wait_s = attempts.DAY_S * (taken_s / daily_s - 1.0)
+        raise TooMany(
+            f"jobs of token {caller.name} have taken {taken_s:.0f} s of CPU of the {daily_s:.0f} s that "
+            f"it has in a day (AMERS_QUOTA_CPU_SECONDS); try again in {wait_s / 60.0 + 1.0:.0f} minutes"
         )
     kept_jobs = usage.read_usage(connection, caller.id).jobs
     if kept_jobs >= settings.quota_kept_jobs:

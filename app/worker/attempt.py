@@ -30,6 +30,11 @@ from app.worker.warm_process import WarmProcess, WarmServer
 
 FAILURES_ALLOWED = 3
 """A job fails when this many attempts at it have ended without an outcome."""
+ATTEMPTS_ALLOWED = 10
+"""A job that ends its process or its worker every time fails after so many attempts."""
+KILLED = (-signal.SIGKILL, -signal.SIGTERM)
+"""Exit codes of a process that did not end by itself: the kernel found no memory, the server of warm
+processes has died, or somebody stops the service. No job can be blamed for these."""
 POLL_S = 0.2
 LONGEST_BEAT_S = 2.0
 """Longest time between renewals of a lease; a dismissed job is noticed within this time."""
@@ -168,6 +173,12 @@ class Attempts:
                 f"the job writes a file larger than {limit}, the limit of this service "
                 "(AMERS_JOB_FILE_BYTES)",
             )
+        elif code in KILLED and job.attempt < ATTEMPTS_ALLOWED:
+            with self.database.transaction() as connection:
+                delay_s = self.settings.lease_seconds * min(job.attempt, FAILURES_ALLOWED)
+                attempts.try_again(connection, job.id, job.attempt, delay_s, counts=False)
+        elif code in KILLED:
+            self._fail(job, "Process killed", f"the process was killed in {job.attempt} attempts")
         elif failures >= FAILURES_ALLOWED and code == NO_ROOM:
             self._fail(job, "No room", f"a disk of the service was full in {failures} attempts")
         elif failures >= FAILURES_ALLOWED:
@@ -202,6 +213,17 @@ class Attempts:
                 return self._watch(job, process)
             finally:
                 process.close()
+                self._count(job, process.cpu_s)
+
+    def _count(self, job: Job, cpu_s: float) -> None:
+        """Record the CPU of an attempt for its owner, however it ended."""
+        try:
+            with self.database.transaction() as connection:
+                attempts.count_cpu(connection, job.owner, cpu_s, self.settings.quota_cpu_seconds)
+        except psycopg.Error as error:
+            if (outage := outage_of(error)) is None:
+                raise
+            log.warning("job %s: %.0f s of CPU are not recorded: %s", job.id, cpu_s, outage.reason)
 
     def _watch(self, job: Job, process: WarmProcess) -> int:
         """Renew the lease until the process ends or must end."""

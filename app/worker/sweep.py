@@ -22,7 +22,7 @@ from app.usecases import garbage_collection, results, retention, storage_identit
 from app.usecases.blocks.uploads import remove_expired_archives
 from app.usecases.garbage_collection import Bin, remove_unnamed_chips, remove_unnamed_files
 from app.usecases.uploads import UPLOAD_PREFIX, remove_abandoned_uploads
-from app.worker.attempt import FAILURES_ALLOWED
+from app.worker.attempt import ATTEMPTS_ALLOWED
 
 SILENT_WORKER_S = 60.0
 """A worker of the queue sends a heartbeat every ten seconds; without one for this long it is dead."""
@@ -93,7 +93,7 @@ def sweep_jobs(database: Database, lease_s: float, running_limit: int | None = N
     with database.transaction() as connection:
         if not queue.may_sweep(connection):
             return
-        for job_id in attempts.take_back(connection, FAILURES_ALLOWED):
+        for job_id in attempts.take_back(connection, ATTEMPTS_ALLOWED):
             log.warning("job %s: taken back from a worker whose lease expired", job_id)
         queue.forget_dead_entries(connection, SILENT_WORKER_S)
         if issued := queue.replace_lost_tickets(connection, lease_s, running_limit):

@@ -65,6 +65,12 @@ class WarmProcess:
             self._received += received
         return int(self._received.split()[1])
 
+    @property
+    def cpu_s(self) -> float:
+        """CPU that the process took with its children, seconds; 0 before its end, and when unknown."""
+        numbers = self._received.split()
+        return float(numbers[2]) if len(numbers) > 2 else 0.0
+
     def close(self) -> None:
         """Kill the process and wait for its end; one that has not started yet never does."""
         with self._connection:

@@ -3,7 +3,8 @@
 Started as `python -m app.worker.warm_server SOCKET`, with the descriptor of a socket to its parent. Each
 message of this socket asks for one process: a JSON document with its function and arguments, and the
 descriptor of a connection of its own. Over this connection the server sends the number of the process,
-and later its exit code. When the parent closes its side, the process is killed with all it started.
+and later its exit code and the CPU that it took with its children, seconds. When the parent closes its
+side, the process is killed with all it started.
 """
 
 import ctypes
@@ -144,15 +145,15 @@ def _fork(
 def _report_end(child: _Child) -> None:
     """Send the exit code of a process that has ended, after all it started has been killed."""
     _kill(child.pid)
-    _, status = os.waitpid(child.pid, 0)
-    _send(child.connection, os.waitstatus_to_exitcode(status))
+    _, status, used = os.wait4(child.pid, 0)
+    _send(child.connection, os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime)
     child.connection.close()
     os.close(child.ending)
 
 
-def _send(connection: socket.socket, number: int) -> None:
+def _send(connection: socket.socket, *numbers: float) -> None:
     with suppress(OSError):
-        connection.sendall(f"{number}\n".encode())
+        connection.sendall(" ".join(map(str, numbers)).encode() + b"\n")
 
 
 def _kill(pid: int) -> None:

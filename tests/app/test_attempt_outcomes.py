@@ -14,7 +14,7 @@ from app.db.jobs.jobs import Job
 from app.errors import InputError
 from app.storage import Storage
 from app.worker import attempt
-from app.worker.attempt import NO_ROOM, OUT_OF_MEMORY, Attempts
+from app.worker.attempt import ATTEMPTS_ALLOWED, NO_ROOM, OUT_OF_MEMORY, Attempts
 from tests.app.job_queue import new_job, state_of
 from tests.statements import run_sql
 
@@ -31,12 +31,14 @@ class Processes:
         code: None: they go on until they are closed.
         storage: a file of the attempt is left there.
         closed: whether the last one was ended by the worker.
+        cpu_s: CPU that they took.
         waited_s: how long the worker wanted to wait for them.
     """
 
     code: int | None
     storage: Storage
     closed: bool = False
+    cpu_s: float = 0.0
     waited_s: float = 0.0
 
     def start(
@@ -126,6 +128,23 @@ def test_a_job_whose_process_broke_off_is_tried_three_times(worker: Worker, code
     assert (job.state, job.error["title"]) == ("failed", title)
 
 
+@pytest.mark.parametrize("code", [-signal.SIGKILL, -signal.SIGTERM])
+def test_a_process_that_others_kill_costs_the_job_no_attempt_of_its_own(worker: Worker, code: int):
+    for _ in range(3):
+        job = worker.attempt_ends(code)
+        assert (job.state, job.failures, job.error) == ("accepted", 0, None)
+    assert worker.attempt_ends(CRASH).failures == 1
+
+
+def test_a_job_whose_process_is_killed_every_time_ends(worker: Worker):
+    for _ in range(ATTEMPTS_ALLOWED - 1):
+        assert worker.attempt_ends(-signal.SIGKILL).state == "accepted"
+    job = worker.attempt_ends(-signal.SIGKILL)
+    assert job.error is not None
+    assert (job.state, job.error["title"]) == ("failed", "Process killed")
+    assert f"in {ATTEMPTS_ALLOWED} attempts" in job.error["detail"]
+
+
 def test_the_pause_before_the_next_attempt_grows_with_the_failures(worker: Worker):
     for failures in (1, 2):
         worker.attempt_ends(CRASH)
@@ -183,3 +202,13 @@ def test_a_worker_whose_database_was_upgraded_claims_nothing(worker: Worker):
         ).do_next_job()
     job = state_of(worker.database, worker.job.id)
     assert (job.state, job.attempt) == ("accepted", 0)
+
+
+@pytest.mark.parametrize("code", [0, CRASH, OUT_OF_MEMORY, None])
+def test_the_cpu_of_an_attempt_counts_for_its_owner_however_it_ends(worker: Worker, code: int | None):
+    worker.settings = worker.settings.model_copy(update={"job_seconds": 0.1})
+    processes = Processes(code, worker.storage, cpu_s=50.0)
+    worker.attempt_of(processes)
+    with worker.database.transaction() as connection:
+        rows = run_sql(connection, "select cpu_s from job_turn").fetchall()
+    assert [row["cpu_s"] for row in rows] == [50.0]

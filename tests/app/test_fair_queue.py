@@ -18,7 +18,7 @@ from app.db.engine import Connection, Database
 from app.db.jobs import attempts, jobs, progress, queue
 from app.db.jobs.attempts import LostJob
 from app.usecases.tokens import create_token
-from app.worker.attempt import FAILURES_ALLOWED
+from app.worker.attempt import ATTEMPTS_ALLOWED
 from app.worker.sweep import sweep_jobs
 from tests.app.job_queue import LEASE_S, let_lease_lapse, tickets
 from tests.app.worker_processes import ended, running_worker, wait_until
@@ -265,10 +265,10 @@ def test_the_next_job_of_an_owner_is_called_when_one_has_lost_too_many_workers(c
     run_sql(connection, "delete from procrastinate_jobs")
     run_sql(
         connection,
-        "update job set lease_until = now() - interval '1 s', failures = %s where id = %s",
-        [FAILURES_ALLOWED - 1, lost],
+        "update job set lease_until = now() - interval '1 s', attempt = %s where id = %s",
+        [ATTEMPTS_ALLOWED, lost],
     )
-    assert attempts.take_back(connection, FAILURES_ALLOWED) == [lost]
+    assert attempts.take_back(connection, ATTEMPTS_ALLOWED) == [lost]
     assert tickets(connection) == 1
     assert claim(connection, 1).id == waiting
 
@@ -361,7 +361,7 @@ class Crowd:
             attempts.fail(connection, job.id, job.attempt, {"title": "no"})
         elif roll < 0.5:
             attempts.renew(connection, job.id, job.attempt, -1.0)
-            attempts.take_back(connection, FAILURES_ALLOWED)
+            attempts.take_back(connection, ATTEMPTS_ALLOWED)
         else:
             attempts.succeed(connection, job.id, job.attempt, {})
 

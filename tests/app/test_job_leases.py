@@ -13,7 +13,7 @@ from app.db.jobs import attempts, jobs, queue
 from app.db.jobs.attempts import LostJob
 from app.db.jobs.jobs import Job
 from app.storage import Storage
-from app.worker.attempt import FAILURES_ALLOWED
+from app.worker.attempt import ATTEMPTS_ALLOWED
 from app.worker.sweep import sweep_files, sweep_jobs
 from tests.app.job_queue import LEASE_S, claimed, let_lease_lapse, new_job, state_of, tickets
 from tests.statements import run_sql
@@ -177,14 +177,14 @@ def test_a_job_that_fails_keeps_what_it_made_all_the_same(database: Database):
 
 def test_a_job_that_outlives_too_many_workers_fails(database: Database):
     job = new_job(database)
-    for _ in range(FAILURES_ALLOWED):
+    for _ in range(ATTEMPTS_ALLOWED):
         claimed(database, job.id)
         let_lease_lapse(database, job.id)
         sweep_jobs(database, LEASE_S)
     failed = state_of(database, job.id)
     assert failed.state == "failed"
     assert failed.error is not None
-    assert f"died {FAILURES_ALLOWED} times" in failed.error["detail"]
+    assert f"the last of {ATTEMPTS_ALLOWED} attempts" in failed.error["detail"]
 
 
 def lost_once(database: Database, job: Job) -> None:
@@ -195,7 +195,7 @@ def lost_once(database: Database, job: Job) -> None:
 
 def lost_for_good(database: Database, job: Job) -> None:
     """The job loses as many workers as it may."""
-    for attempt in range(1, FAILURES_ALLOWED + 1):
+    for attempt in range(1, ATTEMPTS_ALLOWED + 1):
         if attempt > 1:
             claimed(database, job.id)
         lost_once(database, job)
@@ -257,7 +257,7 @@ def test_a_job_that_has_lost_too_many_workers_says_so_in_problem_details(databas
     failed = state_of(database, job.id)
     assert failed.error is not None
     assert {"type", "title", "detail"} <= failed.error.keys()
-    assert failed.error["failures"] == failed.failures == FAILURES_ALLOWED
+    assert (failed.error["attempts"], failed.failures) == (ATTEMPTS_ALLOWED, 0)
     assert failed.message == failed.error["detail"]
 
 

@@ -147,6 +147,28 @@ def test_a_token_has_no_more_open_jobs_than_its_quota(connection, settings):
     quotas.require_free_job(connection, settings, few)
 
 
+def test_a_token_whose_jobs_took_the_cpu_of_a_day_waits_until_some_is_given_back(connection, settings):
+    one, other = (create_token(connection, name, ["register"]).token for name in ("one", "other"))
+    day = settings.model_copy(update={"quota_cpu_seconds": 1000.0})
+    for token in (one, other):
+        job = jobs.create(connection, "register-scene", {}, token.id)
+        assert attempts.claim_next(connection, "w", 30.0) is not None
+    attempts.count_cpu(connection, one.id, 600.0, 1000.0)
+    quotas.require_free_job(connection, day, one)
+    attempts.count_cpu(connection, one.id, 500.0, 1000.0)
+    jobs.dismiss(connection, job.id)
+    with pytest.raises(TooMany, match=r"one have taken 1100 s of CPU of the 1000 s .* 14\d minutes"):
+        quotas.require_free_job(connection, day, one)
+    quotas.require_free_job(connection, day, other)
+    run_sql(connection, "update job_turn set cpu_at = clock_timestamp() - interval '12 hours'")
+    assert attempts.cpu_taken(connection, one.id, 1000.0) == pytest.approx(600.0, abs=1.0)
+    quotas.require_free_job(connection, day, one)
+    run_sql(connection, "update job_turn set cpu_at = clock_timestamp() + interval '1 year'")
+    assert attempts.cpu_taken(connection, one.id, 1000.0) == pytest.approx(1100.0, abs=0.1), (
+        "a clock went back"
+    )
+
+
 def test_a_token_uploads_no_more_bytes_than_its_quota(connection, settings):
     small = create_token(connection, "small", ["register"], storage_quota_bytes=1000).token
     assert quotas.require_room(connection, settings, small.id, "an image", 1000) == 1000

@@ -8,7 +8,7 @@ from datetime import timedelta
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import case, func, select, update
+from sqlalchemy import ColumnElement, Double, case, cast, func, select, update
 from sqlalchemy.dialects.postgresql import insert
 
 from app.db.engine import Connection
@@ -19,6 +19,7 @@ from app.db.schema import clock, job, job_turn
 from app.db.statements import named
 
 NEXT_JOB = named("jobs.sql", "next_job")
+DAY_S = 86_400.0
 LOST_WORKER = {"type": "lost-worker", "title": "The worker was lost"}
 
 
@@ -68,6 +69,28 @@ def claim_next(
         )
     )
     return next_job
+
+
+def count_cpu(connection: Connection, owner: UUID | None, cpu_s: float, daily_s: float) -> None:
+    """Add CPU that an attempt took to that of its owner, who is given back so much of it every day."""
+    connection.execute(
+        update(job_turn)
+        .where(job_turn.c.owner.is_not_distinct_from(owner))
+        .values(cpu_s=_cpu_now(daily_s) + cpu_s, cpu_at=clock)
+    )
+
+
+def cpu_taken(connection: Connection, owner: UUID, daily_s: float) -> float:
+    """CPU that jobs of an owner took and that has not been given back, seconds."""
+    taken = connection.scalar(select(_cpu_now(daily_s)).where(job_turn.c.owner == owner))
+    return float(taken or 0.0)
+
+
+def _cpu_now(daily_s: float) -> ColumnElement[float]:
+    """What is left of recorded CPU; a clock that went back gives nothing back, and takes nothing."""
+    elapsed_s = func.greatest(func.extract("epoch", clock - job_turn.c.cpu_at), 0)
+    given_back_s = cast(elapsed_s, Double) * (daily_s / DAY_S)
+    return func.greatest(job_turn.c.cpu_s - given_back_s, 0.0, type_=Double())
 
 
 def renew(connection: Connection, job_id: UUID, attempt: int, lease_s: float) -> None:
@@ -214,10 +237,10 @@ def try_again(
     replace_spent_ticket(connection)
 
 
-def take_back(connection: Connection, failures_allowed: int) -> list[UUID]:
-    """Return jobs whose lease is over to the queue, or fail those that lost too many workers.
+def take_back(connection: Connection, attempts_allowed: int) -> list[UUID]:
+    """Return jobs whose lease is over to the queue, or fail those that had too many attempts.
 
-    Rows that are being written are left to their writers.
+    A lost worker is no failure of the job. Rows that are being written are left to their writers.
     """
     over = (
         select(job.c.id)
@@ -230,7 +253,6 @@ def take_back(connection: Connection, failures_allowed: int) -> list[UUID]:
             update(job)
             .where(job.c.id.in_(over))
             .values(
-                failures=job.c.failures + 1,
                 lease_until=None,
                 worker=None,
                 state="accepted",
@@ -241,11 +263,11 @@ def take_back(connection: Connection, failures_allowed: int) -> list[UUID]:
         ),
     )
     for lost in lapsed:
-        if lost.failures < failures_allowed:
+        if lost.attempt < attempts_allowed:
             issue_ticket(connection)
             continue
-        detail = f"the worker died {lost.failures} times while it did this job"
-        error = {**LOST_WORKER, "detail": detail, "failures": lost.failures}
+        detail = f"the worker was lost in the last of {lost.attempt} attempts at this job"
+        error = {**LOST_WORKER, "detail": detail, "attempts": lost.attempt}
         connection.execute(
             update(job)
             .where(job.c.id == lost.id)
