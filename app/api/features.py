@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from app.api.access import needs
 from app.api.deps import CallerDep, DatabaseDep, SecretDep, SettingsDep
+from app.api.disposition import disposition
 from app.api.negotiation import (
     CRS_HEADER,
     FEATURES,
@@ -316,7 +317,7 @@ def _headers(page: PageRequest) -> dict[str, str]:
     headers = {"Content-Crs": f"<{page.query.selection.crs.uri}>"}
     if page.form not in ("json", "html"):
         file_name = f"{page.collection.id}.{page.form}"
-        headers["Content-Disposition"] = f'attachment; filename="{file_name}"'
+        headers["Content-Disposition"] = disposition(file_name)
     return headers
 
 

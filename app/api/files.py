@@ -8,6 +8,7 @@ from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 
 from app.api.conditions import may_send_range
+from app.api.disposition import disposition
 from app.api.error_responses import problem
 from app.api.methods import HEAD
 from app.api.ranges import Part, content_range, multipart, wanted_ranges
@@ -25,8 +26,13 @@ HEADERS = {
 }
 
 
-def file_reply(request: Request, storage: Storage, key: str, media_type: str) -> Response:
+def file_reply(
+    request: Request, storage: Storage, key: str, media_type: str, name: str | None = None
+) -> Response:
     """A file that a row names, or its ranges, streamed from a folder and from a bucket alike.
+
+    Args:
+        name: under which a browser keeps it; by default the last part of the key.
 
     Raises:
         DamagedFile: there is no such file.
@@ -37,6 +43,7 @@ def file_reply(request: Request, storage: Storage, key: str, media_type: str) ->
     if media_type.startswith("text/"):
         media_type += "; charset=utf-8"
     headers = {**HEADERS, **validators(key, state), "Content-Type": media_type}
+    headers["Content-Disposition"] = disposition(name or key.rpartition("/")[2], media_type)
     ranges = None
     # The standard defines ranges for GET alone.
     if HEAD not in request.scope and may_send_range(request.headers, headers):

@@ -82,7 +82,7 @@ def download_result(
     """Return one file of the results; of scenes registered together its name is `SCENE/NAME`."""
     with database.reading() as connection:
         job = jobs.visible_job(connection, caller, job_id)
-    return file_reply(request, storage, results.result_key(job, name), media_type(name))
+    return file_reply(request, storage, results.result_key(job, name), media_type(name), name)
 
 
 @router.get(
@@ -156,7 +156,7 @@ def _raw_reply(
         links = [f'<{here}/results/{f.name}>; rel="item"; type="{f.media_type}"' for f in files]
         return Response(status_code=HTTPStatus.NO_CONTENT, headers={"Link": ", ".join(links)})
     if not values and len(files) == 1:
-        return file_reply(request, storage, files[0].key, files[0].media_type)
+        return file_reply(request, storage, files[0].key, files[0].media_type, files[0].name)
     parts: list[Part] = [
         (name, {"Content-Type": JSON}, json.dumps(value).encode()) for name, value in values.items()
     ]

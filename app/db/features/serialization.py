@@ -3,7 +3,7 @@
 import json
 from typing import Any
 
-from sqlalchemy import ColumnElement, Text, cast, func
+from sqlalchemy import ColumnElement, Text, case, cast, func
 
 from app.db.constants import integer_constant, text_constant
 from app.db.features.collection import Property
@@ -15,6 +15,9 @@ DEGREE_DIGITS = 9
 """Decimals of a degree in replies: a tenth of a millimetre."""
 METRE_DIGITS = 4
 QUOTE = text_constant('"')
+APOSTROPHE = text_constant("'")
+FORMULA = text_constant(r"^[=@\t\r]|^[+-](?!([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?$)")
+"""Texts that a table calculator would compute; numbers are not."""
 
 
 def feature_text(layout: Layout) -> ColumnElement[str]:
@@ -80,6 +83,7 @@ def _json(item: Property) -> ColumnElement[Any]:
 def _csv(item: Property) -> ColumnElement[str]:
     text: ColumnElement[str] = cast(plain_value(item), Text())
     if item.type == "text":
+        text = case((text.op("~")(FORMULA), APOSTROPHE.concat(text)), else_=text)
         doubled = func.replace(text, QUOTE, text_constant('""'), type_=Text())
         text = QUOTE.concat(doubled).concat(QUOTE)
     return func.coalesce(text, text_constant("")) if item.nullable else text
