@@ -54,7 +54,8 @@ def read_block(folder: Path) -> BlockContents:
         FormatError: a file is missing or unreadable, or the views do not match the points.
     """
     document = read_document(folder)
-    points, views = read_points(folder / POINTS_PARQUET), read_views(folder / VIEWS_PARQUET)
+    points = read_points(folder / POINTS_PARQUET, document.counts.points)
+    views = read_views(folder / VIEWS_PARQUET, document.counts.views)
     expected = np.repeat(points.id, np.maximum(points.chip_count, 0))
     if len(expected) != len(views.point_id) or (expected != views.point_id).any():
         raise FormatError(

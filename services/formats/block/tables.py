@@ -207,13 +207,17 @@ def write_views(path: Path, rows: ViewRows, images: tuple[Acquisition, ...]) -> 
     pq.write_table(pa.Table.from_arrays(arrays, schema=VIEWS_SCHEMA), path, compression="zstd")
 
 
-def read_points(path: Path) -> PointRows:
+def read_points(path: Path, most_rows: int) -> PointRows:
     """The rows of a `points.parquet`; values are not checked, an empty point is NaN.
 
+    Args:
+        most_rows: a file with more is refused before it is unpacked.
+
     Raises:
-        FormatError: the file is not Parquet, or a column is missing, has another type or is null.
+        FormatError: the file is not Parquet, or a column is missing, has another type or is null; or it
+            has more rows.
     """
-    table = _read_table(path, POINTS_SCHEMA, SURFACE_SCHEMA)
+    table = _read_table(path, most_rows, POINTS_SCHEMA, SURFACE_SCHEMA)
     try:
         geometry = shapely.from_wkb(table["geometry"].to_numpy())
     except shapely.errors.ShapelyError as error:
@@ -247,13 +251,17 @@ def read_points(path: Path) -> PointRows:
     )
 
 
-def read_views(path: Path) -> ViewRows:
+def read_views(path: Path, most_rows: int) -> ViewRows:
     """The rows of a `views.parquet`; values are not checked.
 
+    Args:
+        most_rows: a file with more is refused before it is unpacked.
+
     Raises:
-        FormatError: the file is not Parquet, or a column is missing, has another type or is null.
+        FormatError: the file is not Parquet, or a column is missing, has another type or is null; or it
+            has more rows.
     """
-    table = _read_table(path, VIEWS_SCHEMA)
+    table = _read_table(path, most_rows, VIEWS_SCHEMA)
     image, image_ids = _dictionary_encoded(table["image_id"])
     chip_file, chip_files = _dictionary_encoded(table["chip_file"])
     return ViewRows(
@@ -277,13 +285,21 @@ def _surface(table: pa.Table) -> SurfaceHeights | None:
     return SurfaceHeights(*(table[name].to_numpy() for name in SURFACE_SCHEMA.names))
 
 
-def _read_table(path: Path, schema: pa.Schema, optional: pa.Schema | None = None) -> pa.Table:
+def _read_table(
+    path: Path, most_rows: int, schema: pa.Schema, optional: pa.Schema | None = None
+) -> pa.Table:
     """The columns of a schema, and those of an optional one if the file has them all."""
     try:
         with pq.ParquetFile(path, memory_map=False) as file:
             if optional is not None and set(optional.names) <= set(file.schema_arrow.names):
                 schema = pa.unify_schemas([schema, optional])
             _check_schema(path.name, file.schema_arrow, schema)
+            # A thousand equal rows take a byte in the file, and a hundred thousand in memory.
+            if file.metadata.num_rows > most_rows:
+                raise FormatError(
+                    f"{path.name}: {file.metadata.num_rows} rows found, {most_rows} expected as "
+                    "amers:counts of block.json states"
+                )
             table = file.read(columns=schema.names)
         # A file may declare text that is not UTF-8, or offsets beyond its buffers.
         table.validate(full=True)

@@ -333,4 +333,20 @@ def test_a_covariance_without_volume_is_refused_and_one_that_has_nearly_none_is_
             assert "positive definite" in str(problems_of(block.folder))
 
 
+def test_a_table_of_more_rows_than_stated_is_refused_before_it_is_unpacked(block):
+    path = block.folder / "views.parquet"
+    table = pq.read_table(path)
+    row, count = table.slice(0, 1), 5_000_000
+    with pq.ParquetWriter(path, table.schema, compression="zstd") as writer:
+        many = pa.Table.from_arrays(
+            [pa.repeat(column[0], count // 5) for column in row.columns], schema=table.schema
+        )
+        for _ in range(5):
+            writer.write_table(many, row_group_size=count // 5)
+    assert path.stat().st_size < 1_000_000
+    resigned(block.folder)
+    with pytest.raises(FormatError, match=rf"views.parquet: {count} rows found, \d+ expected"):
+        check_block(block.folder)
+
+
 CORRELATIONS = ("corr_east_north", "corr_east_up", "corr_north_up")
