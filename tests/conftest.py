@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+from app.child_processes import SAFE_PATH
 from tests.run_folders import DISK, MEMORY, end_dead_runs, place_of_databases, run_folder
 
 # Until all tests are collected: it would look again and again through modules that live to the end.
@@ -27,6 +28,18 @@ for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_
 
 LEFT_OUT = pytest.StashKey[Counter[str]]()
 """How many tests a fast run leaves out, by reason."""
+
+
+@pytest.fixture(autouse=True)
+def own_places_of_modules() -> Iterator[None]:
+    """Undo what commands in the process of a test set for the processes that libraries start."""
+    before = {name: os.environ.get(name) for name in SAFE_PATH}
+    yield
+    for name, value in before.items():
+        if value is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -18,6 +18,8 @@ MOST_HEAD_BYTES = 1 << 16
 """Limit of what arrives beside bodies: a head, trailers, sizes of chunks."""
 LINGER_S = 2.0
 """So long the rest of too large a head is thrown away; its sender would miss an abrupt reply."""
+MOST_THROWN_AWAY_BYTES = 16 << 20
+"""So much of it: a sender that has not stopped by then does not read the reply."""
 ABSOLUTE = re.compile(rb"[A-Za-z][A-Za-z0-9+.\-]*://([^/?#]*)(.*)", re.DOTALL)
 
 log = logging.getLogger(__name__)
@@ -75,9 +77,13 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Parse what arrived, if it does not grow without an end."""
-        if self._refused or self.transport.is_closing():
+        if self.transport.is_closing():
             return
         self._beside_bodies += len(data)
+        if self._refused:
+            if self._beside_bodies > MOST_THROWN_AWAY_BYTES:
+                self.transport.abort()
+            return
         super().data_received(data)
         if self._beside_bodies > MOST_HEAD_BYTES:
             self._refuse_head()

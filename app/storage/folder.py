@@ -28,7 +28,7 @@ from app.storage.files import (
     locked,
 )
 from app.storage.marker import MARKER, Marker, parse_marker
-from app.storage.proof import Proof
+from app.storage.proof import NOT_MOUNTED, Proof
 
 
 @dataclass(frozen=True)
@@ -231,6 +231,8 @@ class Storage:
         """Make the folder for unfinished files in the proven folder, whatever is mounted meanwhile."""
         if self.proof is None:
             self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        elif self.look() is None:
+            raise StorageOutage(f"{self.place}: {NOT_MOUNTED}: there is no such folder", NOT_MOUNTED)
         with opened_folder(self.folder) as folder:
             found = os.fstat(folder)
             if (found.st_dev, found.st_ino) != self.look():

@@ -16,8 +16,11 @@ from fastapi.testclient import TestClient
 from app.config import Settings
 from app.db import engine, revisions
 from app.db.cluster.embedded import SUPERUSER, Cluster
+from app.db.engine import Database
 from app.db.jobs import attempts
 from app.main import create_app
+from app.storage import Storage
+from app.usecases import storage_identity
 from app.worker.sweep import sweep_jobs
 from tests.app.conftest import EMPTY_TEMPLATE, TEMPLATE, fresh_database
 from tests.app.full_storage import database_name
@@ -174,7 +177,11 @@ def test_the_jobs_of_a_release_are_shown_with_messages_and_results(client: TestC
     assert client.get(f"/jobs/{done}", headers=headers["other"]).status_code == 404
 
 
-def test_quotas_count_what_a_release_has_kept(client: TestClient, headers, dsn: str):
+def test_quotas_count_what_a_release_has_kept(
+    client: TestClient, headers, dsn: str, database: Database, storage: Storage
+):
+    storage.folder.mkdir(parents=True)
+    storage_identity.adopt(database.transaction, storage)
     (scene,) = all_rows(dsn, "select id from scene where name = 'scene.tif'")
     body = {"inputs": {"scene": str(scene["id"])}}
     (owner,) = all_rows(

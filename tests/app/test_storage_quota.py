@@ -21,8 +21,8 @@ from app.db.engine import Connection, Database
 from app.db.jobs import attempts, jobs
 from app.db.tokens import Token
 from app.errors import TooLarge, TooMany
-from app.storage import Storage, open_storage
-from app.usecases import quotas, results
+from app.storage import Storage
+from app.usecases import quotas, results, storage_identity
 from app.usecases.blocks import lifecycle
 from app.usecases.installation import Installation
 from app.usecases.scenes import SentFile, upload_scene, upload_side_file
@@ -53,8 +53,8 @@ def settings(
 
 
 @pytest.fixture
-def storage(settings: Settings) -> Storage:
-    return open_storage(settings)
+def storage(settings: Settings, database: Database) -> Storage:
+    return storage_identity.opened(database, settings)
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor, wait
+from uuid import uuid4
 
 import pytest
 
@@ -187,7 +188,7 @@ def test_a_secret_and_a_session_open_a_valid_token_of_a_secret_alone(connection,
     run_sql(connection, f"update token set {change}")
     for opened in (
         lambda: authenticate(connection, new.secret),
-        lambda: authenticate_session(connection, new.token.id),
+        lambda: authenticate_session(connection, new.token.id, uuid4()),
     ):
         if valid:
             assert opened().id == new.token.id
