@@ -76,7 +76,9 @@ def test_an_interrupted_backup_says_so_and_leaves_nothing(
 ):
     module, _, name = stage.rpartition(".")
     place = f"app.usecases.backups.make:{stage}" if not module else f"app.db.cluster.backup:{name}"
-    interrupted = KILLED_AT.replace("os.getpid(), 9", f"os.getpid(), {int(signal.SIGINT)}")
+    # Processes in the background of a shell start with interrupts ignored.
+    heeding = "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)"
+    interrupted = heeding + KILLED_AT.replace("os.getpid(), 9", f"os.getpid(), {int(signal.SIGINT)}")
     monkeypatch.setattr("tests.app.test_backup_sets.KILLED_AT", interrupted)
     ended = amers(full.settings, "db", "backup", tmp_path / "backups" / "monday", killed_at=place)
     assert ended.returncode == 130, ended.stderr
