@@ -21,7 +21,7 @@ FORMULA = text_constant(r"^[=@\t\r]|^[+-](?!([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?
 
 
 def feature_text(layout: Layout) -> ColumnElement[str]:
-    """One feature as GeoJSON text; texts and dates are quoted by to_json, numbers are finite."""
+    """One feature as GeoJSON text; texts are quoted by to_json, numbers are finite."""
     collection, crs = layout.collection, layout.crs
     digits = integer_constant(DEGREE_DIGITS if crs.in_degrees else METRE_DIGITS)
     geometry = in_own_order(from_storage(collection.geometry, crs), crs)
@@ -35,8 +35,7 @@ def feature_text(layout: Layout) -> ColumnElement[str]:
         text_constant(',"properties":{'),
     ]
     for place, item in enumerate(layout.properties):
-        comma = "," if place else ""
-        parts += [text_constant(f"{comma}{json.dumps(item.name)}:"), _json(item)]
+        parts += _member(f"{',' if place else ''}{json.dumps(item.name)}:", item)
     return func.concat(*parts, text_constant("}}"), type_=Text())
 
 
@@ -70,14 +69,23 @@ def csv_text(layout: Layout) -> ColumnElement[str]:
     return func.concat_ws(text_constant(","), *values, type_=Text())
 
 
+def _member(name: str, item: Property) -> list[ColumnElement[Any]]:
+    """The texts of a member; one where the value may be unknown, which takes less time than two."""
+    value = _json(item)
+    if not item.nullable:
+        return [text_constant(name), value]
+    known = text_constant(name).concat(cast(value, Text()))
+    return [func.coalesce(known, text_constant(f"{name}null"))]
+
+
 def _json(item: Property) -> ColumnElement[Any]:
-    # A date of to_json is that of RFC 3339, in half the time of to_char.
-    value = item.expression if item.type == "date" else plain_value(item)
-    if not item.is_number and item.type != "boolean":
-        value = func.to_json(value)
-    if item.nullable:
-        return func.coalesce(cast(value, Text()), text_constant("null"))
-    return value if item.is_number else cast(value, Text())
+    """A value that is known, as JSON; the session writes dates in ISO 8601."""
+    if item.type == "date":
+        return QUOTE.concat(cast(item.expression, Text())).concat(QUOTE)
+    value = plain_value(item)
+    if item.is_number:
+        return value
+    return cast(value if item.type == "boolean" else func.to_json(value), Text())
 
 
 def _csv(item: Property) -> ColumnElement[str]:
