@@ -47,14 +47,13 @@ class Storage:
     folder: Path
     proof: Proof | None = field(default=None, kw_only=True, compare=False, repr=False)
 
-    def prove(self) -> None:
-        """Check that the storage is that of its installation.
+    def prove(self) -> Hashable:
+        """Check that the storage is that of its installation; returns its place in its file system.
 
         Raises:
             StorageOutage: it is not, as when it is not mounted.
         """
-        if self.proof is not None:
-            self.proof.require(self)
+        return self.look() if self.proof is None else self.proof.require(self)
 
     @contextmanager
     def proven(self) -> Iterator[None]:
@@ -235,9 +234,8 @@ class Storage:
             raise StorageOutage(f"{self.place}: {NOT_MOUNTED}: there is no such folder", NOT_MOUNTED)
         with opened_folder(self.folder) as folder:
             found = os.fstat(folder)
-            if (found.st_dev, found.st_ino) != self.look():
+            if (found.st_dev, found.st_ino) != self.prove():
                 raise StorageOutage(f"{self.place}: another folder was mounted meanwhile")
-            self.prove()
             with suppress(FileExistsError):
                 os.mkdir(UNFINISHED, 0o700, dir_fd=folder)
 

@@ -57,27 +57,30 @@ class Proof:
         """Look closely before the next write."""
         self._looked_at = float("-inf")
 
-    def require(self, storage: Provable) -> None:
-        """Check that a storage is that of the installation.
+    def require(self, storage: Provable) -> Hashable:
+        """Check that a storage is that of the installation; returns the place that is.
 
         Raises:
             StorageOutage: it is not, or cannot be read.
         """
-        if self._installation is None:
-            return
         asked_at = time.monotonic()
         place = storage.look()
+        if self._installation is None:
+            return place
         is_proven = place == self._place and asked_at - self._looked_at < VALID_S
         if is_proven or (place is not None and place == self._granted):
-            return
+            return place
         with self._lock:
-            # Who waited for the look of another takes its outcome: a silent bucket holds up once.
-            if self._looked_at < asked_at:
+            # Who waited for the look of another takes its outcome: a silent bucket holds up once. But
+            # that look may have been at another place, where the storage was before.
+            is_elsewhere = self._failure is None and place != self._place
+            if self._looked_at < asked_at or is_elsewhere:
                 self._place = None
                 self._failure = self._find_failure(storage)
                 self._looked_at = time.monotonic()
             if self._failure is not None:
                 raise StorageOutage(str(self._failure), self._failure.reason)
+            return self._place
 
     @contextmanager
     def granted(self, storage: Provable, installation: UUID) -> Iterator[None]:

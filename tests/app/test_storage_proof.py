@@ -2,6 +2,7 @@
 
 import errno
 import os
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -357,3 +358,48 @@ def test_a_service_on_a_read_only_database_starts_and_reads(
         reply = again.get(f"/scenes/{scene}/files/a.tif", headers=me)
         assert (reply.status_code, reply.content) == (200, TIFF)
         assert again.post("/scenes?name=b.tif", content=TIFF, headers=me).status_code == 503
+
+
+class _Remounted:
+    """A storage that is not mounted any more while somebody reads its marker."""
+
+    place = "somewhere"
+
+    def __init__(self, installation: UUID) -> None:
+        self.here: str = "the storage"
+        self.reading, self.go_on = threading.Event(), threading.Event()
+        self._marker = Marker(installation, 1)
+
+    def look(self) -> str:
+        return self.here
+
+    def look_closely(self) -> tuple[str, Marker | None]:
+        here = self.here
+        self.reading.set()
+        assert self.go_on.wait(10.0)
+        return here, self._marker if here == "the storage" else None
+
+
+def test_who_waits_for_the_proof_of_another_place_takes_none() -> None:
+    installation = uuid4()
+    storage, known = _Remounted(installation), proof.Proof()
+    known.bind(installation)
+    first = threading.Thread(target=known.require, args=(storage,))
+    first.start()
+    assert storage.reading.wait(10.0)
+    storage.here = "the mount point"
+    outcome: list[Exception | object] = []
+
+    def require() -> None:
+        try:
+            outcome.append(known.require(storage))
+        except StorageOutage as outage:
+            outcome.append(outage)
+
+    second = threading.Thread(target=require)
+    second.start()
+    time.sleep(0.2)  # It has looked, and waits for the first.
+    storage.go_on.set()
+    first.join()
+    second.join()
+    assert isinstance(outcome[0], StorageOutage), outcome
