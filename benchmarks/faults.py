@@ -3,10 +3,12 @@
 Scenes are uploaded whole and in pieces, and registered; blocks are ingested and exported; backups are
 made. Meanwhile the API, two workers, the processes of their jobs, PostgreSQL and running backups are
 killed (SIGKILL) again and again. A killed process is restarted within a second. The storage is not
-mounted for some seconds, and the database is read-only, as often as asked for. At the end, every
-accepted upload and job must exist, every job must have ended once, every result, block and backup must
-be complete or absent, rows and files must refer to each other after the sweep, and the quotas of all
-owners must add up to what the storage holds.
+mounted for some seconds, and the database is read-only, as often as requested.
+
+At the end the run checks that every accepted upload and job exists, that every job has ended once, and
+that every result, block and backup is complete or absent. After the sweep, rows and files must refer to
+each other. The quotas of all owners must add up to the size of the storage.
+
 Run: python -m benchmarks.faults [--registrations 100 --ingestions 40 --uploads 40 --exports 20 ...]
 """
 

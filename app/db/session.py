@@ -39,7 +39,7 @@ PATIENCE: dict[str, Any] = {
 }
 """Parameters of a connection, unless the address has its own: what is cut is noticed within seconds."""
 LOCK_WAIT = "60s"
-"""Longest wait for what others hold: a transaction that somebody left open holds it for ever."""
+"""Longest wait for a lock: a transaction that was left open would keep it for ever."""
 SETTINGS: dict[str, str] = {
     # What values look like, in both directions.
     "client_encoding": "UTF8",

@@ -34,9 +34,9 @@ class Provable(Protocol):
 
 
 class Proof:
-    """What is known of the installation of one storage. Threads may share it.
+    """The identity of one storage, checked before each write. Threads may share it.
 
-    Until it is told the installation, nothing is checked: every use case that writes tells it.
+    Nothing is checked before `bind`: every use case that writes binds the proof first.
     """
 
     def __init__(self) -> None:

@@ -83,7 +83,7 @@ def restore(dsn: str, file: Path) -> None:
     if missing:
         log.warning(
             "the archive has reference systems that the PostGIS of this database lacks (SRID %s): Amers "
-            " uses none of them, and only the owner of PostGIS can add them",
+            "uses none of them, and only the owner of PostGIS can add them",
             ", ".join(map(str, missing)),
         )
 

@@ -397,7 +397,7 @@ def _time(moment: Moment) -> _Value:
 
 
 def _time_literal(node: dict[str, Any]) -> _Value:
-    """The value of `DATE(…)`, which holds a date, or of `TIMESTAMP(…)`, which holds a time."""
+    """The value of a literal: a date in `DATE(…)`, an instant in `TIMESTAMP(…)`."""
     name = "date" if "date" in node else "timestamp"
     value = _time(parse_moment(node[name], "filter"))
     if value.is_date != (name == "date"):

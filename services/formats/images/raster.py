@@ -42,8 +42,8 @@ class RasterImage:
 
     Attributes:
         path: of the file, or its address.
-        dataset: the dataset that `open_raster` opened; it tells about the image.
-        pixels: what its pixels are read from.
+        dataset: the dataset that `open_raster` opened, with the metadata of the image.
+        pixels: the dataset from which pixels are read: the same one, or a working copy.
         mix: the bands and their weights.
         codes: what the product says about its pixels, beside what the file says.
     """
