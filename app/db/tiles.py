@@ -58,8 +58,7 @@ CELL_FIELDS: tuple[ColumnElement[Any], ...] = (
     cast(SERVED / AREA_KM2, REAL()).label("points_per_km2"),
 )
 _VARIANCE_EAST_M2, _VARIANCE_NORTH_M2 = (
-    func.power(sigma, integer_constant(2), type_=Double)
-    for sigma in (point.c.sigma_east_m, point.c.sigma_north_m)
+    cast(sigma, Double) * sigma for sigma in (point.c.sigma_east_m, point.c.sigma_north_m)
 )
 SIGMA_HORIZONTAL_M: ColumnElement[float] = cast(
     func.sqrt((_VARIANCE_EAST_M2 + _VARIANCE_NORTH_M2) / integer_constant(2)), REAL()
@@ -128,7 +127,8 @@ class Layer:
 POINT_LAYER = Layer(
     name="points",
     source=point.outerjoin(point_history, point_history.c.point_id == point.c.id),
-    geometry=func.st_setsrid(func.st_force2d(point.c.geom), integer_constant(4326)),
+    # Tiles leave heights out by themselves.
+    geometry=func.st_setsrid(point.c.geom, integer_constant(4326)),
     indexed=point.c.geom,
     fields=(
         point.c.id,

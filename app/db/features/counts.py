@@ -54,21 +54,26 @@ def _compile_explain(element: _Explain, compiler: SQLCompiler, **options: Any) -
     return f"EXPLAIN (FORMAT json) {compiler.process(element.statement, **options)}"
 
 
-def count(connection: Connection, selection: Selection) -> Count:
-    """The number of selected features: exact up to 10,000, an estimate beyond."""
+def count(connection: Connection, selection: Selection, least: int = 0) -> Count:
+    """The number of selected features: exact up to 10,000, an estimate beyond.
+
+    Args:
+        least: so many are known to be selected; beyond 10,000 nothing is counted again.
+    """
     collection = selection.collection
     if selection.condition is ANYTHING and collection.total is not None:
         total = connection.execute(collection.total, selection.viewer.parameters).scalar_one()
         return Count(int(total), exact=True)
-    try:
-        with driver(connection).transaction():
-            driver(connection).execute(LIMIT_TIME.sql, LIMIT_TIME.constants)
-            number = _count_few(connection, selection)
-        if number <= EXACT_COUNT:
-            return Count(number, exact=True)
-        least = EXACT_COUNT + 1
-    except psycopg.errors.QueryCanceled:
-        least = 1
+    if least <= EXACT_COUNT:
+        try:
+            with driver(connection).transaction():
+                driver(connection).execute(LIMIT_TIME.sql, LIMIT_TIME.constants)
+                number = _count_few(connection, selection)
+            if number <= EXACT_COUNT:
+                return Count(number, exact=True)
+            least = EXACT_COUNT + 1
+        except psycopg.errors.QueryCanceled:
+            least = max(1, least)
     return Count(max(least, _estimate(connection, selection)), exact=False)
 
 

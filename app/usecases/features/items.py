@@ -168,7 +168,7 @@ def _matched(connection: Connection, query: ResolvedQuery, last: Key | None, ret
         return query.matched
     if last is None and query.after is None:
         return Count(returned, exact=True)
-    return counts.count(connection, query.selection)
+    return counts.count(connection, query.selection, returned + (last is not None))
 
 
 def _next(query: ResolvedQuery, last: Key | None, matched: Count, secret: bytes) -> str | None:
