@@ -38,7 +38,7 @@ class Server:
 
     Attributes:
         name: of the software.
-        process: its first process; each service has one process that replies.
+        process: its first process.
         items: path of the collection of points.
         page: parameters of a page request besides its box.
         tiles: path of its vector tiles, up to the zoom; "" without any.
@@ -50,6 +50,13 @@ class Server:
     items: str
     page: str
     tiles: str = ""
+
+    @property
+    def replying(self) -> int:
+        """The number of the one process that replies: the child of a supervisor, where there is one."""
+        first = self.process.pid
+        children = Path(f"/proc/{first}/task/{first}/children").read_text().split()
+        return int(children[0]) if children else first
 
     def connect(self) -> http.client.HTTPConnection:
         """A kept-alive connection."""

@@ -301,7 +301,7 @@ def chips(store: Store, repeats: int) -> Times:
 def page_memory(store: Store, repeats: int) -> dict[str, float]:
     """Resident memory of our process before and after pages of 10,000, and its peak between."""
     ask = kinds(store.ground)["page of 10,000"]
-    process, open_one = store.server.process.pid, store.server.connect()
+    process, open_one = store.server.replying, store.server.connect()
     Path(f"/proc/{process}/clear_refs").write_text("5")
     before = resident_mib(process, "VmRSS")
     size = 0
