@@ -1,6 +1,7 @@
 """The HTTP application: its routers and its middleware."""
 
 import sys
+from asyncio import create_task, sleep
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import version
@@ -100,15 +101,16 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         app.state.settings = settings
         app.state.database = await run_in_threadpool(opening.__enter__)
         app.state.storage = open_storage(settings)
-        if await run_in_threadpool(
-            storage_identity.announce, app.state.database.transaction, app.state.storage
-        ):
-            await run_in_threadpool(reserve.keep, settings)
+        installation = Installation(app.state.database, app.state.storage, settings)
+        is_prepared = await run_in_threadpool(_prepare_storage, installation)
+        preparing = None if is_prepared else create_task(_prepare_storage_later(installation))
         app.state.chips = open_chips(app.state.database, app.state.storage)
-        app.state.readiness = Readiness(Installation(app.state.database, app.state.storage, settings))
+        app.state.readiness = Readiness(installation)
         try:
             yield
         finally:
+            if preparing is not None:
+                preparing.cancel()
             app.state.readiness.close()
             app.state.chips.close()
             await run_in_threadpool(opening.__exit__, None, None, None)
@@ -143,3 +145,19 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     for router in ROUTERS:
         app.include_router(router)
     return app
+
+
+def _prepare_storage(installation: Installation) -> bool:
+    """Prepare the storage and keep a reserve in it; returns whether it belongs to the database."""
+    is_prepared = storage_identity.announce(installation.database.transaction, installation.storage)
+    if is_prepared:
+        reserve.keep(installation.settings)
+    return is_prepared
+
+
+async def _prepare_storage_later(installation: Installation) -> None:
+    """Prepare a storage that was away, or whose database was, when the service began."""
+    is_prepared = False
+    while not is_prepared:
+        await sleep(storage_identity.RETRY_S)
+        is_prepared = await run_in_threadpool(_prepare_storage, installation)

@@ -241,13 +241,23 @@ class Storage:
 
     @contextmanager
     def scratch_folder(self, prefix: str) -> Iterator[Path]:
-        """A folder in `scratch` that is deleted at the end of the context, and not swept before."""
-        with (
-            self.proven(),
-            TemporaryDirectory(prefix=prefix, dir=self.scratch()) as folder,
-            locked(Path(folder)),
-        ):
-            yield Path(folder)
+        """A folder in `scratch` that is deleted at the end of the context, and not swept before.
+
+        Who works in it makes missing folders of a path. After an unmount they lie in the mount point,
+        which is left as empty as it was.
+        """
+        place = self.look()
+        try:
+            with (
+                self.proven(),
+                TemporaryDirectory(prefix=prefix, dir=self.scratch()) as folder,
+                locked(Path(folder)),
+            ):
+                yield Path(folder)
+        finally:
+            with suppress(OSError, StorageOutage):
+                if self.look() != place:
+                    (self.folder / UNFINISHED).rmdir()
 
     def fetch(self, key: str, folder: Path) -> Path:
         """The path of a file on this machine, for libraries that open files; do not change the file.

@@ -16,6 +16,7 @@ from app.errors import InputError, StorageOutage
 from app.storage.marker import MARKER, Marker
 
 VALID_S = 1.0
+UNKNOWN = "it is not known yet whether the storage of files is that of the database"
 NOT_MOUNTED = "the storage of files is not mounted, is empty or is another one"
 
 
@@ -36,7 +37,7 @@ class Provable(Protocol):
 class Proof:
     """The identity of one storage, checked before each write. Threads may share it.
 
-    Nothing is checked before `bind`: every use case that writes binds the proof first.
+    Nothing is written before `bind`: only the database tells which installation it is.
     """
 
     def __init__(self) -> None:
@@ -63,10 +64,10 @@ class Proof:
         Raises:
             StorageOutage: it is not, or cannot be read.
         """
+        if self._installation is None:
+            raise StorageOutage(f"{storage.place}: {UNKNOWN}", UNKNOWN)
         asked_at = time.monotonic()
         place = storage.look()
-        if self._installation is None:
-            return place
         is_proven = place == self._place and asked_at - self._looked_at < VALID_S
         if is_proven or (place is not None and place == self._granted):
             return place

@@ -30,6 +30,8 @@ UNNAMED = (
     "the storage names no installation: it is not mounted, it is another one, or the database does not "
     "know its files"
 )
+RETRY_S = 10.0
+"""Time between two tries of a service to prepare its storage."""
 PROBE = "probe.txt"
 """Key of the tiny file that tries a storage; top-level keys belong to no block, scene or job."""
 KNOWN_SHARE = 0.95
@@ -46,7 +48,7 @@ def mismatch(connection: Connection, storage: Storage) -> str | None:
 
     A storage that names no installation belongs to none; `prepare` looks whether to adopt it.
     """
-    return _compare(storage, installation.read(connection), lambda: UNNAMED)
+    return _compare(storage, expect(connection, storage), lambda: UNNAMED)
 
 
 def require_match(database: Database, storage: Storage) -> None:
@@ -56,7 +58,6 @@ def require_match(database: Database, storage: Storage) -> None:
         Conflict: it does not.
     """
     with database.reading() as connection:
-        expect(connection, storage)
         reason = mismatch(connection, storage)
     if reason is not None:
         raise Conflict(reason)

@@ -30,8 +30,6 @@ LONGEST_POLL_S = 5.0
 """Longest time until a delayed ticket is found; new tickets notify the workers."""
 PAUSE_S = 2.0
 """Pause before the queue is read again after an outage of the database."""
-STORAGE_RETRY_S = 10.0
-"""Pause before a worker without jobs looks again whether the storage belongs to the database."""
 ENDING_S = 60.0
 """A worker that is still there so long after its signal ends at once, whatever its threads wait for."""
 
@@ -55,7 +53,7 @@ def run_worker(settings: Settings) -> None:
         _sweeping(database, storage, settings, stop),
     ):
         while not stop.is_set() and not storage_identity.announce(database.transaction, storage):
-            stop.wait(STORAGE_RETRY_S)
+            stop.wait(storage_identity.RETRY_S)
         loop = asyncio.new_event_loop()
         # Not asyncio.run: it waits for ever when a task of the queue swallows its cancellation.
         loop.run_until_complete(_Worker(database, processes, settings, stop).run())

@@ -14,13 +14,14 @@ from app.db import engine, stored_files
 from app.db.cluster.embedded import Cluster
 from app.db.engine import Connection
 from app.main import create_app
-from app.storage import Storage, open_storage
+from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block
 from app.usecases.tokens import create_token
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.s3_server import running_bucket
 from tests.factories import make_block
 from tests.statements import run_sql
+from tests.unproven import unproven_storage
 
 TIFF = b"II*\0" + bytes(1000)
 FAMILIES = ("chips", "scenes", "results", "uploads")
@@ -53,7 +54,7 @@ def contents(storage: Storage) -> dict[str, bytes]:
 
 def run_service(settings: Settings, folder: Path, seed: int) -> None:
     """Run a service for a moment: it gets files of every family."""
-    storage = open_storage(settings)
+    storage = unproven_storage(settings)
     dsn = settings.database_url.get_secret_value() if settings.database_url else ""
     with TestClient(create_app(settings)) as client:
         with engine.connect(dsn) as connection:
@@ -115,4 +116,4 @@ def filled(kind: str, dsn: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -
             # For services in processes of their own.
             monkeypatch.setenv("AMERS_STORAGE_URL", settings.storage_url)
         run_service(settings, folder, 1)
-        yield Full(dsn, settings, contents(open_storage(settings)))
+        yield Full(dsn, settings, contents(unproven_storage(settings)))

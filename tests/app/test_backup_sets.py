@@ -33,6 +33,7 @@ from app.worker.sweep import sweep_files
 from tests.app.conftest import EMPTY_TEMPLATE, fresh_database
 from tests.app.full_storage import Full, another, contents
 from tests.statements import run_sql
+from tests.unproven import unproven_storage
 
 pytestmark = pytest.mark.thorough
 
@@ -95,7 +96,7 @@ def empty(full: Full, dsn: str, folder: Path) -> Settings:
 
 def assert_whole(settings: Settings, files: dict[str, bytes]) -> None:
     """The restored installation has all files, a database that names them, and sweeps none of them."""
-    storage = open_storage(settings)
+    storage = unproven_storage(settings)
     assert contents(storage) == files
     assert not storage.exists(RESTORING)
     with engine.opened(settings) as database:
@@ -131,11 +132,11 @@ def test_a_backup_restores_database_and_files_of_an_installation(
         assert_whole(settings, placed(full))
     with engine.opened(full.settings) as database:
         sweep_files(database, open_storage(full.settings), 3600.0)
-    assert contents(open_storage(full.settings)) == full.files, "the original continues"
+    assert contents(unproven_storage(full.settings)) == full.files, "the original continues"
 
 
 def test_a_backup_names_every_kind_of_stored_file_that_is_damaged(full: Full, tmp_path: Path):
-    storage, keys = open_storage(full.settings), sorted(placed(full))
+    storage, keys = unproven_storage(full.settings), sorted(placed(full))
     assert {key.split("/")[0] for key in keys} == {"chips", "results", "scenes", "uploads"}
     assert len(keys) == 5, "image and side file are two"
     for key in keys:
@@ -155,7 +156,7 @@ def test_a_backup_names_every_kind_of_stored_file_that_is_damaged(full: Full, tm
 @pytest.mark.parametrize("kind", ["folder"])
 def test_a_file_that_is_missing_is_named_and_the_others_are_in_the_backup(full: Full, tmp_path: Path):
     gone, *others = sorted(placed(full))
-    open_storage(full.settings).delete(gone)
+    unproven_storage(full.settings).delete(gone)
     manifest = backed_up(full, tmp_path / "backup")
     assert [(item.key, item.reason) for item in manifest.damaged] == [(gone, "missing")]
     assert {file.path for file in manifest.files} == {ARCHIVE, *(f"{STORAGE}/{key}" for key in others)}
@@ -258,7 +259,7 @@ def test_a_kill_during_a_backup_leaves_nothing_that_looks_like_one(full: Full, t
     backed_up(full, folder)
     assert find_problems(folder, read_manifest(folder)) == []
     assert list(folder.parent.iterdir()) == [folder]
-    assert contents(open_storage(full.settings)) == full.files
+    assert contents(unproven_storage(full.settings)) == full.files
 
 
 @pytest.mark.parametrize("kind", ["folder"])
@@ -285,7 +286,7 @@ def test_a_restore_that_broke_off_mends_its_files_and_takes_no_other_database(
     backed_up(full, tmp_path / "backup")
     with fresh_database(cluster, EMPTY_TEMPLATE) as dsn, another(cluster) as other:
         settings = empty(full, dsn, tmp_path / "restored")
-        storage = open_storage(settings)
+        storage = unproven_storage(settings)
         with monkeypatch.context() as patch:
             patch.setattr(archive, "restore", broken)
             with pytest.raises(InputError, match="broke"):
@@ -304,7 +305,7 @@ def test_a_restored_storage_names_the_installation_and_the_generation_of_its_bac
     """Before any service has looked at it: by then a later backup would not fit it any more."""
     manifest = backed_up(full, tmp_path / "backup")
     with fresh_database(cluster, EMPTY_TEMPLATE) as dsn:
-        storage = open_storage(empty(full, dsn, tmp_path / "restored"))
+        storage = unproven_storage(empty(full, dsn, tmp_path / "restored"))
         restore_backup(dsn, storage, tmp_path / "backup")
         with engine.connect(dsn) as connection:
             row = installation.read(connection)
@@ -317,7 +318,7 @@ def test_a_restored_storage_names_the_installation_and_the_generation_of_its_bac
 @pytest.mark.parametrize("kind", ["folder"])
 def test_the_database_of_a_backup_is_older_than_the_storage_that_goes_on(full: Full, tmp_path: Path):
     manifest = backed_up(full, tmp_path / "backup")
-    marker = read_marker(open_storage(full.settings))
+    marker = read_marker(unproven_storage(full.settings))
     assert marker is not None
     assert marker.generation > manifest.generation
 
@@ -326,7 +327,7 @@ def test_the_database_of_a_backup_is_older_than_the_storage_that_goes_on(full: F
 def test_a_backup_survives_what_others_do_meanwhile(
     full: Full, cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    storage = open_storage(full.settings)
+    storage = unproven_storage(full.settings)
     image, side_file = sorted(storage.keys("scenes"))
     (result,) = storage.keys("results")
     dump = archive.dump
@@ -363,7 +364,7 @@ def test_a_backup_needs_its_own_storage_and_a_new_folder(full: Full, tmp_path: P
     backed_up(full, tmp_path / "backup")
     with pytest.raises(Conflict, match="exists"):
         backed_up(full, tmp_path / "backup")
-    open_storage(full.settings).delete(MARKER)
+    unproven_storage(full.settings).delete(MARKER)
     with pytest.raises(Conflict, match="amers store adopt"):
         backed_up(full, tmp_path / "other")
     assert not (tmp_path / "other").exists()

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from app.storage import open_storage
 from app.usecases.backups.manifest import find_problems, read_manifest
 from tests.app.full_storage import Full, contents
 from tests.app.small_disk import Disk
 from tests.app.test_backup_sets import KILLED_AT, amers, backed_up
+from tests.unproven import unproven_storage
 
 pytestmark = pytest.mark.thorough
 
@@ -41,7 +41,7 @@ def assert_one_sentence(stderr: str) -> None:
 
 @pytest.mark.parametrize("size_bytes", [IN_THE_ARCHIVE, IN_THE_FILES])
 def test_a_backup_on_a_full_disk_says_so_and_leaves_nothing(size_bytes: int, full: Full, disk: Disk):
-    storage = open_storage(full.settings)
+    storage = unproven_storage(full.settings)
     (image,) = [key for key in storage.keys("scenes") if key.endswith("a.tif")]
     (storage.local(image) or Path()).write_bytes(bytes(2 * IN_THE_FILES))
     disk.grow(size_bytes)
@@ -84,4 +84,4 @@ def test_an_interrupted_backup_says_so_and_leaves_nothing(
     assert ended.returncode == 130, ended.stderr
     assert "Traceback" not in ended.stderr
     assert list((tmp_path / "backups").iterdir()) == []
-    assert contents(open_storage(full.settings)) == full.files
+    assert contents(unproven_storage(full.settings)) == full.files

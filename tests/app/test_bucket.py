@@ -14,9 +14,10 @@ import pytest
 
 from app.config import Settings
 from app.errors import DamagedFile, InputError, NotFound, StorageOutage, TooLarge
-from app.storage import Storage, StoredChips, bucket, chips_key, open_storage
+from app.storage import Storage, StoredChips, bucket, chips_key
 from services.conventions import CHIP_SIZE
 from tests.app.s3_server import KEYS, running_bucket
+from tests.unproven import unproven_storage
 
 SEVERAL_PARTS = 12_000_000
 """Size of a file that is sent in several parts."""
@@ -26,7 +27,7 @@ SEVERAL_PARTS = 12_000_000
 def storage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Storage]:
     with pytest.MonkeyPatch.context() as patch, running_bucket(patch) as url:
         folder = tmp_path_factory.mktemp("machine")
-        yield open_storage(Settings(data_folder=folder, storage_url=url))
+        yield unproven_storage(Settings(data_folder=folder, storage_url=url))
 
 
 def unfinished(storage: Storage) -> list[Path]:
@@ -144,8 +145,8 @@ def test_a_file_is_read_by_position_and_in_small_steps(storage: Storage):
 def test_a_storage_that_is_opened_twice_is_one(storage: Storage):
     settings = Settings(data_folder=storage.folder.parent, storage_url=storage.place)
     again, elsewhere = (
-        open_storage(settings),
-        open_storage(settings.model_copy(update={"storage_url": f"{storage.place}/other"})),
+        unproven_storage(settings),
+        unproven_storage(settings.model_copy(update={"storage_url": f"{storage.place}/other"})),
     )
     assert again == storage != elsewhere
     assert len({storage, again, elsewhere}) == 2
@@ -176,7 +177,7 @@ def test_a_request_that_fails_is_repeated_and_not_for_long(
         thread.start()
         try:
             monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.server_port}")
-            unwilling = open_storage(Settings(data_folder=tmp_path, storage_url="s3://bucket/test"))
+            unwilling = unproven_storage(Settings(data_folder=tmp_path, storage_url="s3://bucket/test"))
             with pytest.raises(StorageOutage, match="scenes/a: the storage does not answer"):
                 unwilling.size("scenes/a")
         finally:

@@ -10,13 +10,13 @@ from fastapi.testclient import TestClient
 from app.config import Settings
 from app.db import engine
 from app.main import create_app
-from app.storage import open_storage
 from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from services.formats.sensor_models.rpc_files import read_rpc
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
 from tests.app.registration_outputs import A_TENTH_OF_A_PIXEL, largest_error_px
 from tests.app.s3_server import running_bucket
 from tests.app.worker_processes import ended, running_worker
+from tests.unproven import unproven_storage
 
 pytestmark = pytest.mark.thorough
 
@@ -45,7 +45,7 @@ def settings(dsn: str, tmp_path: Path, url: str) -> Settings:
 def test_a_scene_is_registered_with_all_files_in_a_bucket(
     client: TestClient, bearer: Bearer, settings: Settings, world: FlatWorld, dsn: str, tmp_path: Path
 ):
-    storage, me = open_storage(settings), bearer("register")
+    storage, me = unproven_storage(settings), bearer("register")
     with engine.connect(dsn) as connection:
         block = ingest_block(connection, storage, world.block).block
         publish_block(connection, str(block.number))

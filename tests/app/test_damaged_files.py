@@ -19,7 +19,7 @@ from app.cli.main import app as commands
 from app.config import Settings
 from app.db.engine import Connection, Database
 from app.main import create_app
-from app.storage import Storage, open_storage, trash
+from app.storage import Storage, trash
 from app.usecases.blocks import lifecycle
 from app.usecases.installation import Installation
 from app.usecases.jobs import do_attempt
@@ -30,6 +30,7 @@ from tests.app.job_queue import claimed
 from tests.app.s3_server import running_bucket
 from tests.factories import BOX, make_block
 from tests.statements import run_sql
+from tests.unproven import unproven_storage
 
 pytestmark = pytest.mark.thorough
 
@@ -158,7 +159,7 @@ def filled(
     settings: Settings, database: Database, connection: Connection, bearer: Bearer, tmp_path: Path
 ) -> Iterator[Filled]:
     """The installation, filled."""
-    storage = open_storage(settings)
+    storage = unproven_storage(settings)
     with TestClient(create_app(settings), raise_server_exceptions=False) as client:
         lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block").folder)
         lifecycle.publish_block(connection, "calanques")

@@ -17,7 +17,6 @@ from app.db import engine, references
 from app.db.engine import Connection, Database
 from app.errors import Conflict, InputError, NotFound
 from app.main import create_app
-from app.storage import open_storage
 from app.usecases.jobs import do_attempt
 from app.usecases.references import (
     NewReference,
@@ -41,6 +40,7 @@ from tests.app.job_queue import claim
 from tests.app.s3_server import running_bucket
 from tests.app.worker_processes import ended, running_worker
 from tests.statements import run_sql
+from tests.unproven import unproven_storage
 
 pytestmark = pytest.mark.thorough
 
@@ -295,7 +295,7 @@ def test_a_service_whose_files_are_in_a_bucket_registers_on_a_reference(
             report = client.get(results["report.json"]["href"], headers=me).json()
         shift_px = np.array(report["correction"]["shift_px"])
         assert np.abs(shift_px - SHIFT_PX).max() < A_TENTH_OF_A_PIXEL
-        result_keys = open_storage(elsewhere).keys(f"results/{ended_job['jobID']}")
+        result_keys = unproven_storage(elsewhere).keys(f"results/{ended_job['jobID']}")
         assert any(key.endswith("report.json") for key in result_keys)
     assert not [path for path in settings.data_folder.rglob("*") if path.is_file()], "all in the bucket"
     with engine.connect(dsn) as connection:

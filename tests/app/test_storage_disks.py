@@ -15,7 +15,7 @@ from app.db.cluster import embedded
 from app.db.cluster.embedded import DATABASE, SUPERUSER, Cluster
 from app.db.engine import Database
 from app.main import create_app
-from app.storage import Storage, open_storage, trash
+from app.storage import Storage, trash
 from app.usecases.blocks.lifecycle import ingest_block
 from app.usecases.installation import Installation
 from app.usecases.tokens import create_token
@@ -23,6 +23,7 @@ from tests.app.full_storage import finish_job
 from tests.app.small_disk import BindMount, Disk
 from tests.factories import make_block
 from tests.statements import run_sql
+from tests.unproven import unproven_storage
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
@@ -102,7 +103,7 @@ def test_scenes_blocks_results_and_uploads_are_deleted_on_a_full_disk(
     made = make_block(tmp_path / "block", count=5)
     tus = admin | {"Tus-Resumable": "1.0.0"}
     with TestClient(create_app(on_disk), raise_server_exceptions=False) as client:
-        storage = open_storage(on_disk)
+        storage = unproven_storage(on_disk)
         with engine.connect(dsn) as connection:
             block = ingest_block(connection, storage, made.folder).block
             finish_job(connection, storage)
@@ -130,7 +131,7 @@ def test_scenes_blocks_results_and_uploads_are_deleted_on_a_full_disk(
 def test_the_reserve_is_given_up_for_a_deletion_and_made_again(
     database: Database, on_disk: Settings, disk: Disk
 ):
-    storage = open_storage(on_disk)
+    storage = unproven_storage(on_disk)
     with TestClient(create_app(on_disk)):
         pass
     file = on_disk.data_folder / reserve.NAME

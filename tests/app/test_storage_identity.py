@@ -25,6 +25,7 @@ from tests.app.full_storage import FAMILIES, Full, another, contents, run_servic
 from tests.app.running_service import running_service
 from tests.app.worker_processes import wait_until
 from tests.statements import run_sql
+from tests.unproven import unproven_storage
 
 JOB_S = 3600.0
 LEASE_S = 0.3
@@ -51,7 +52,7 @@ def assert_untouched(
     full: Full, dsn: str, reason: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A worker on a database removes nothing from the full storage, and says why and what to do."""
-    storage = open_storage(full.settings)
+    storage = unproven_storage(full.settings)
     before = contents(storage)
     marker = storage.open(MARKER).read() if storage.exists(MARKER) else None
     settings = full.settings.model_copy(update={"database_url": Settings(database_url=dsn).database_url})
@@ -75,7 +76,7 @@ def test_an_empty_database_beside_a_full_storage_removes_nothing(
 def test_the_trash_of_another_installation_is_not_emptied(
     full: Full, cluster: Cluster, monkeypatch: pytest.MonkeyPatch
 ):
-    storage = open_storage(full.settings)
+    storage = unproven_storage(full.settings)
     key = next(key for key in full.files if storage.exists(key))
     trash.discard(storage, [key], Moment(date(2026, 11, 22), 310))
     before = contents(storage)
@@ -94,7 +95,7 @@ def test_the_trash_of_another_installation_is_not_emptied(
 def test_an_empty_database_beside_a_storage_of_an_earlier_version_removes_nothing(
     full: Full, cluster: Cluster, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
-    open_storage(full.settings).delete(MARKER)
+    unproven_storage(full.settings).delete(MARKER)
     with another(cluster) as empty:
         assert_untouched(full, empty, f"knows 0 of its {len(full.files)} files", monkeypatch, caplog)
 
@@ -123,7 +124,7 @@ def test_an_older_backup_of_the_database_removes_nothing(
 ):
     with another(cluster, full.dsn) as backup:
         run_service(full.settings, tmp_path, 3)
-        assert len(contents(open_storage(full.settings))) == 2 * len(full.files)
+        assert len(contents(unproven_storage(full.settings))) == 2 * len(full.files)
         assert_untouched(full, backup, "the database is older than the storage", monkeypatch, caplog)
 
 
@@ -144,7 +145,7 @@ def test_a_service_on_an_empty_database_beside_a_full_storage_says_so_and_remove
     assert storage["status"] == "failed"
     assert "another installation" in storage["reason"]
     assert "amers store adopt" in storage["reason"]
-    assert contents(open_storage(full.settings)) == full.files
+    assert contents(unproven_storage(full.settings)) == full.files
 
 
 @pytest.mark.parametrize("kind", ["folder"])
@@ -155,12 +156,12 @@ def test_a_storage_that_is_not_mounted_gets_no_files_of_its_own(
     with engine.opened(unmounted) as database:
         assert not storage_identity.announce(database.transaction, open_storage(unmounted))
     assert "not mounted" in caplog.text
-    assert not open_storage(unmounted).exists(MARKER)
+    assert not unproven_storage(unmounted).exists(MARKER)
 
 
 @pytest.mark.parametrize("kind", ["folder"])
 def test_a_storage_of_an_earlier_version_is_adopted_by_its_own_database(full: Full):
-    storage = open_storage(full.settings)
+    storage = unproven_storage(full.settings)
     storage.delete(MARKER)
     with engine.connect(full.dsn) as connection:
         run_sql(connection, "update installation set storage_generation = 0")
@@ -174,7 +175,7 @@ def test_a_storage_of_an_earlier_version_is_adopted_by_its_own_database(full: Fu
 def test_an_adopted_storage_is_swept_by_its_new_database_and_not_by_the_former_one(
     full: Full, cluster: Cluster
 ):
-    storage = open_storage(full.settings)
+    storage = unproven_storage(full.settings)
     with another(cluster) as dsn, engine.pooled(dsn, full.settings) as database:
         assert storage_identity.prepare(database.transaction, storage) is not None
         storage_identity.adopt(database.transaction, storage)
@@ -195,7 +196,7 @@ def test_an_adopted_storage_is_swept_by_its_new_database_and_not_by_the_former_o
 
 @pytest.mark.thorough
 def test_what_the_sweep_removes_lies_in_the_trash_for_days_of_calendar_and_uptime(full: Full):
-    storage, key = open_storage(full.settings), f"scenes/{uuid4()}/left.tif"
+    storage, key = unproven_storage(full.settings), f"scenes/{uuid4()}/left.tif"
     storage.put(key, [b"left by a killed process"])
     with engine.opened(full.settings) as database:
         sweep_files(database, storage, JOB_S)
@@ -221,7 +222,7 @@ def test_what_the_sweep_removes_lies_in_the_trash_for_days_of_calendar_and_uptim
 def test_many_unknown_files_at_once_stay_until_an_operator_lets_them_go(
     full: Full, caplog: pytest.LogCaptureFixture
 ):
-    storage = open_storage(full.settings)
+    storage = unproven_storage(full.settings)
     stray = [f"scenes/{uuid4()}/a.tif" for _ in range(garbage_collection.FILES_AT_ONCE + 1)]
     for key in stray:
         storage.put(key, [b"x"])
@@ -237,7 +238,7 @@ def test_many_unknown_files_at_once_stay_until_an_operator_lets_them_go(
 @pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["folder"])
 def test_nothing_is_swept_at_the_first_ticks_of_a_worker(full: Full):
-    storage, stop = open_storage(full.settings), threading.Event()
+    storage, stop = unproven_storage(full.settings), threading.Event()
     storage.put(f"scenes/{uuid4()}/left.tif", [b"left by a killed process"])
     before = contents(storage)
     brisk = full.settings.model_copy(update={"lease_seconds": LEASE_S})
@@ -251,7 +252,7 @@ def test_nothing_is_swept_at_the_first_ticks_of_a_worker(full: Full):
 
 
 def test_a_worker_advances_the_generation_of_its_storage(full: Full, monkeypatch: pytest.MonkeyPatch):
-    storage = open_storage(full.settings)
+    storage = unproven_storage(full.settings)
     before = read_marker(storage)
     monkeypatch.setattr(sweep, "GENERATION_EVERY_S", 0.0)
     swept(full.settings, monkeypatch, lambda: read_marker(storage) != before)
@@ -262,7 +263,7 @@ def test_a_worker_advances_the_generation_of_its_storage(full: Full, monkeypatch
 
 
 def test_a_file_that_two_workers_sweep_at_once_is_moved_once(full: Full):
-    storage = open_storage(full.settings)
+    storage = unproven_storage(full.settings)
     storage.put("scenes/stray", [b"x"])
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda _: storage.move("scenes/stray", "trash/stray"), range(8)))
@@ -274,7 +275,7 @@ def test_a_file_too_large_to_be_copied_by_the_bucket_goes_to_the_trash_in_parts(
     full: Full, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr("app.storage.bucket.COPY_LIMIT_BYTES", 10)
-    storage, content = open_storage(full.settings), bytes(range(256)) * 100
+    storage, content = unproven_storage(full.settings), bytes(range(256)) * 100
     storage.put("scenes/large", [content])
     storage.move("scenes/large", "trash/large")
     assert not storage.exists("scenes/large")

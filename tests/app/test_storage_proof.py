@@ -13,6 +13,7 @@ import pytest
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner
 
+from app import reserve
 from app.cli.failures import failure
 from app.cli.main import app as amers
 from app.config import Settings
@@ -30,6 +31,7 @@ from tests.app.full_storage import finish_job
 from tests.app.s3_server import running_bucket
 from tests.factories import make_block
 from tests.statements import run_sql
+from tests.unproven import unproven_storage
 
 TIFF = b"II*\0" + bytes(1000)
 TUS = {"Tus-Resumable": "1.0.0"}
@@ -150,7 +152,7 @@ def test_an_emptied_bucket_or_another_one_gets_no_file(
     bucket: Settings, bearer: Bearer, monkeypatch: pytest.MonkeyPatch, marker: Marker | None
 ):
     monkeypatch.setattr(proof, "VALID_S", 0.0)
-    me, unproven = bearer("register"), open_storage(bucket)
+    me, unproven = bearer("register"), unproven_storage(bucket)
     with TestClient(create_app(bucket), raise_server_exceptions=False) as client:
         scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()["id"]
         ours = unproven.open(MARKER).read()
@@ -403,3 +405,42 @@ def test_who_waits_for_the_proof_of_another_place_takes_none() -> None:
     first.join()
     second.join()
     assert isinstance(outcome[0], StorageOutage), outcome
+
+
+def test_nothing_is_written_before_the_installation_is_known(settings: Settings) -> None:
+    storage = open_storage(settings)
+    storage.folder.mkdir(parents=True)
+    with pytest.raises(StorageOutage, match="not known yet"):
+        storage.put("scenes/a", [TIFF])
+    assert list(storage.folder.iterdir()) == []
+
+
+def test_a_storage_that_was_away_at_the_start_is_prepared_when_it_is_back(
+    client: TestClient, bearer: Bearer, mount: Mount, settings: Settings, monkeypatch: pytest.MonkeyPatch
+):
+    me = bearer("register")
+    monkeypatch.setattr(storage_identity, "RETRY_S", 0.1)
+    reserve_file = settings.data_folder / reserve.NAME
+    reserve.give_up(settings)
+    mount.unmount()
+    with TestClient(create_app(settings), raise_server_exceptions=False) as late:
+        assert_refused(late.post("/scenes?name=a.tif", content=TIFF, headers=me))
+        mount.mount()
+        deadline = time.monotonic() + 20.0
+        while not reserve_file.exists() and time.monotonic() < deadline:
+            time.sleep(0.1)
+        assert reserve_file.exists()
+        assert late.post("/scenes?name=a.tif", content=TIFF, headers=me).status_code == 201
+
+
+def test_a_job_under_way_leaves_the_mount_point_empty(client: TestClient, mount: Mount) -> None:
+    storage: Storage = client.app.state.storage  # type: ignore[attr-defined]
+
+    def work() -> None:
+        with storage.scratch_folder("job-") as folder:
+            mount.unmount()
+            (folder / "result" / "attempt").mkdir(parents=True)
+
+    with pytest.raises(StorageOutage):
+        work()
+    mount.mount()  # It checks that nothing was written into the mount point.

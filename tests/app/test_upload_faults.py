@@ -18,11 +18,12 @@ from fastapi.testclient import TestClient
 from app.config import Settings
 from app.db import engine
 from app.main import create_app
-from app.storage import Storage, open_storage
+from app.storage import Storage
 from tests.app.s3_server import running_bucket
 from tests.app.worker_processes import wait_until
 from tests.service_process import free_port
 from tests.statements import run_sql
+from tests.unproven import unproven_storage
 
 pytestmark = pytest.mark.thorough
 
@@ -57,7 +58,7 @@ def settings(
 
 @pytest.fixture
 def storage(settings: Settings) -> Storage:
-    return open_storage(settings)
+    return unproven_storage(settings)
 
 
 @contextmanager
