@@ -72,7 +72,9 @@ class Caller:
         if reply.status_code in BROKEN:
             self.unexpected.append(f"{method} {path}: {reply.status_code} {reply.text[:200]}")
         elif reply.status_code in OUTAGES:
-            self.refused[str(reply.json().get("detail"))] += 1
+            # The reply to HEAD has no body.
+            detail = reply.json().get("detail") if reply.content else f"{method}: {reply.status_code}"
+            self.refused[str(detail)] += 1
         else:
             return reply
         return None
