@@ -21,6 +21,7 @@ RUN python -m venv /opt/amers
 COPY requirements.txt ./
 RUN --mount=type=cache,target=/root/.cache/pip /opt/amers/bin/pip install --require-hashes -r requirements.txt
 COPY pyproject.toml README.md LICENSE ./
+COPY amers amers
 COPY app app
 COPY migrations migrations
 COPY services services

@@ -6,8 +6,8 @@ from dataclasses import replace
 from enum import StrEnum
 from uuid import UUID
 
-from app.db.engine import Connection, Database
-from app.db.tokens import (
+from amers.app.db.engine import Connection, Database
+from amers.app.db.tokens import (
     Token,
     find_subject,
     find_token_of_session,
@@ -15,8 +15,8 @@ from app.db.tokens import (
     is_valid,
     keep_subject,
 )
-from app.errors import NotAllowed
-from app.oidc import Identity
+from amers.app.errors import NotAllowed
+from amers.app.oidc import Identity
 
 SECRET_BYTES = 32
 INVALID_TOKEN = "the token is unknown, expired or revoked"

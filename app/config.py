@@ -13,8 +13,8 @@ from pydantic import Field, SecretStr, ValidationError, field_validator, model_v
 from pydantic_core import PydanticCustomError
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict, SettingsError
 
-from app.errors import InputError
-from app.public_url import normal_public_url
+from amers.app.errors import InputError
+from amers.app.public_url import normal_public_url
 
 GIBIBYTE = 1 << 30
 MEBIBYTE = 1 << 20

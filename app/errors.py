@@ -1,9 +1,9 @@
-"""Errors of the entry points and the store; those of the science are in `services.errors`."""
+"""Errors of the entry points and the store; those of the science are in `amers.services.errors`."""
 
 import errno
 import re
 
-from services.errors import AmersError, ComputationError, InputError, causes_and_contexts
+from amers.services.errors import AmersError, ComputationError, InputError, causes_and_contexts
 
 __all__ = [
     "AmersError",

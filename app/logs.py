@@ -9,9 +9,9 @@ import logging
 import time
 from typing import Any, Literal
 
-from app import request_context
-from app.config import Settings
-from app.printable import printable, printable_json
+from amers.app import request_context
+from amers.app.config import Settings
+from amers.app.printable import printable, printable_json
 
 Format = Literal["text", "json"]
 

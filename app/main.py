@@ -11,8 +11,8 @@ from fastapi import APIRouter, FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware.cors import CORSMiddleware
 
-from app import reserve
-from app.api import (
+from amers.app import reserve
+from amers.app.api import (
     blocks,
     chips,
     collections,
@@ -38,23 +38,23 @@ from app.api import (
     tokens,
     uploads,
 )
-from app.api.body import BoundedBodies
-from app.api.hosts import TrustedHosts
-from app.api.paths import TrailingSlashes
-from app.api.public_address import PublicAddress
-from app.api.reply_headers import ReplyHeaders
-from app.api.request_log import RequestLog, RequestMetrics
-from app.api.routes import CallerRoute
-from app.api.tus import TusRequests
-from app.config import Settings, read_settings
-from app.db import engine
-from app.oidc import Issuer
-from app.storage import open_storage
-from app.usecases import storage_identity
-from app.usecases.damage import open_chips
-from app.usecases.installation import Installation
-from app.usecases.readiness import Readiness
-from app.web import page
+from amers.app.api.body import BoundedBodies
+from amers.app.api.hosts import TrustedHosts
+from amers.app.api.paths import TrailingSlashes
+from amers.app.api.public_address import PublicAddress
+from amers.app.api.reply_headers import ReplyHeaders
+from amers.app.api.request_log import RequestLog, RequestMetrics
+from amers.app.api.routes import CallerRoute
+from amers.app.api.tus import TusRequests
+from amers.app.config import Settings, read_settings
+from amers.app.db import engine
+from amers.app.oidc import Issuer
+from amers.app.storage import open_storage
+from amers.app.usecases import storage_identity
+from amers.app.usecases.damage import open_chips
+from amers.app.usecases.installation import Installation
+from amers.app.usecases.readiness import Readiness
+from amers.app.web import page
 
 SWITCH_INTERVAL_S = 0.0005
 """A thread that computes a large reply lets others run after so long; a small request waits several

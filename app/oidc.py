@@ -11,8 +11,8 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from app.config import Settings
-from app.errors import NotAllowed
+from amers.app.config import Settings
+from amers.app.errors import NotAllowed
 
 ALGORITHMS_OF_KEY_TYPE = {
     "RSA": ("RS256", "RS384", "RS512", "PS256", "PS384", "PS512"),

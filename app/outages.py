@@ -16,8 +16,8 @@ import re
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from app.errors import AmersError, StorageOutage
-from services.errors import causes
+from amers.app.errors import AmersError, StorageOutage
+from amers.services.errors import causes
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
-from app.config import Settings
-from app.outages import outage_of
+from amers.app.config import Settings
+from amers.app.outages import outage_of
 
 NAME = "reserve"
 STORAGE_BYTES = 256 << 10

@@ -12,16 +12,16 @@ import numpy as np
 import rasterio
 from rasterio.windows import Window as RasterWindow
 
+from amers.services.formats.images.scenes import read_scene
+from amers.services.imagery.source import Window
+from amers.services.matching.reference_image import Reference
+from amers.services.registration.on_reference import register_on_reference
+from amers.services.registration.options import ReferenceOptions
+from amers.services.simulation.tiles import TiledView
+from amers.services.simulation.view import ViewPlan, plan_geometry
+from amers.services.simulation.world import make_world
+from amers.services.types import Array
 from benchmarks._measuring import memory_mib
-from services.formats.images.scenes import read_scene
-from services.imagery.source import Window
-from services.matching.reference_image import Reference
-from services.registration.on_reference import register_on_reference
-from services.registration.options import ReferenceOptions
-from services.simulation.tiles import TiledView
-from services.simulation.view import ViewPlan, plan_geometry
-from services.simulation.world import make_world
-from services.types import Array
 
 GSD_M = 0.5
 SHIFT_M = (6.0, -4.0)

@@ -3,14 +3,14 @@
 import numpy as np
 from scipy.stats import chi2
 
-from services.adjustment.bundle import BlockAdjustment
-from services.adjustment.control_observations import ControlObservations
-from services.adjustment.image_correction import adjust_scene
-from services.geodesy import move_metres
-from services.quality.stability import image_places
-from services.sensors.correction import ImageCorrection
-from services.simulation.view import ViewGeometry
-from services.types import Array
+from amers.services.adjustment.bundle import BlockAdjustment
+from amers.services.adjustment.control_observations import ControlObservations
+from amers.services.adjustment.image_correction import adjust_scene
+from amers.services.geodesy import move_metres
+from amers.services.quality.stability import image_places
+from amers.services.sensors.correction import ImageCorrection
+from amers.services.simulation.view import ViewGeometry
+from amers.services.types import Array
 
 MEASURE_SIGMA_PX = 0.1
 _MOST = 300

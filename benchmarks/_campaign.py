@@ -5,18 +5,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from amers.services.errors import AmersError
+from amers.services.imagery.scene import Scene
+from amers.services.quality.accuracy import accuracy, normalised_error
+from amers.services.quality.frames import frame_in_image
+from amers.services.quality.normal_law import normal_ce90
+from amers.services.registration.on_points import Registration, register_scene
+from amers.services.registration.options import RegistrationOptions
+from amers.services.simulation.tiles import Tiles
+from amers.services.types import Array, ChipSource, ControlPoints
 from benchmarks._scenes import Prepared, Truth, prepare
 from benchmarks._trials import Trial
 from benchmarks._worlds import Block, Place
-from services.errors import AmersError
-from services.imagery.scene import Scene
-from services.quality.accuracy import accuracy, normalised_error
-from services.quality.frames import frame_in_image
-from services.quality.normal_law import normal_ce90
-from services.registration.on_points import Registration, register_scene
-from services.registration.options import RegistrationOptions
-from services.simulation.tiles import Tiles
-from services.types import Array, ChipSource, ControlPoints
 
 WRONG = 3.0
 """A result is wrong when its CE90 exceeds the predicted CE90 this many times."""

@@ -13,18 +13,18 @@ from functools import cache, cached_property, partial
 
 import numpy as np
 
-from services.adjustment.control_ground import ControlGround, joined_ground
-from services.adjustment.parameters import ImageParameters, image_parameters
-from services.geodesy import lon_lat_h_from_east_north_up, metres_per_degree_at, move_metres
-from services.imagery.source import ArrayImage
-from services.map_grid import MapGrid
-from services.quality.site_reach import KnownSite
-from services.sensors.base import SensorModel
-from services.sensors.ortho import OrthoModel, ReliefDisplacement
-from services.sensors.rpc_fit import fit_rpc
-from services.simulation.orbit import pushbroom_over
-from services.terrain import Terrain
-from services.types import Array, BoolArray, Frame, IntArray, Observations
+from amers.services.adjustment.control_ground import ControlGround, joined_ground
+from amers.services.adjustment.parameters import ImageParameters, image_parameters
+from amers.services.geodesy import lon_lat_h_from_east_north_up, metres_per_degree_at, move_metres
+from amers.services.imagery.source import ArrayImage
+from amers.services.map_grid import MapGrid
+from amers.services.quality.site_reach import KnownSite
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.ortho import OrthoModel, ReliefDisplacement
+from amers.services.sensors.rpc_fit import fit_rpc
+from amers.services.simulation.orbit import pushbroom_over
+from amers.services.terrain import Terrain
+from amers.services.types import Array, BoolArray, Frame, IntArray, Observations
 
 SITES = {
     "GVAC": (-22.949, 16.741),

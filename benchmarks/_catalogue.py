@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from services.imagery.catalogue import ImageCatalogue
-from services.types import Array
+from amers.services.imagery.catalogue import ImageCatalogue
+from amers.services.types import Array
 
 SCENE_KM = 60.0
 KM_PER_DEGREE = 111.2

@@ -7,7 +7,7 @@ from typing import Any
 
 import shapely
 
-from services.imagery.catalogue import ImageCatalogue
+from amers.services.imagery.catalogue import ImageCatalogue
 
 
 def write_catalogue(catalogue: ImageCatalogue, folder: Path) -> Path:

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pyceres
 
-from services.adjustment.block_problem import BlockProblem
-from services.adjustment.block_solution import State
-from services.adjustment.parameters import BlockPriors, ImageParameters
-from services.geodesy import move_metres
-from services.types import Array
+from amers.services.adjustment.block_problem import BlockProblem
+from amers.services.adjustment.block_solution import State
+from amers.services.adjustment.parameters import BlockPriors, ImageParameters
+from amers.services.geodesy import move_metres
+from amers.services.types import Array
 
 
 class _Ray(pyceres.CostFunction):  # type: ignore[misc]

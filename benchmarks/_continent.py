@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from services.errors import InputError
-from services.geodesy import metres_per_degree
-from services.simulation.archive import (
+from amers.services.errors import InputError
+from amers.services.geodesy import metres_per_degree
+from amers.services.simulation.archive import (
     CENTRE_LON_LAT,
     CONTINENT,
     FIRST_DAY,
@@ -36,12 +36,12 @@ from services.simulation.archive import (
     older_views,
     view_geometry,
 )
-from services.simulation.changes import Change, apply_changes, draw_changes, scatter_things
-from services.simulation.render import surface_seen
-from services.simulation.tiles import TiledView
-from services.simulation.view import ViewGeometry
-from services.simulation.world import World, flood, make_world
-from services.types import Array
+from amers.services.simulation.changes import Change, apply_changes, draw_changes, scatter_things
+from amers.services.simulation.render import surface_seen
+from amers.services.simulation.tiles import TiledView
+from amers.services.simulation.view import ViewGeometry
+from amers.services.simulation.world import World, flood, make_world
+from amers.services.types import Array
 
 SIZES = {"continent": CONTINENT, "small": SMALL}
 SMALLEST_HILL_M = 900.0

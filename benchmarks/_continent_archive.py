@@ -11,16 +11,16 @@ import rasterio.features
 import shapely
 from rasterio.windows import Window as RasterWindow
 
+from amers.services.formats.images.raster import gdal_rpc
+from amers.services.imagery.catalogue import ImageCatalogue
+from amers.services.imagery.source import Window
+from amers.services.sensors.rpc import RpcModel
+from amers.services.simulation.archive import ArchiveView
+from amers.services.simulation.conditions import clouds_over
+from amers.services.simulation.tiles import TILE_PX
+from amers.services.types import Array
 from benchmarks._catalogue_files import write_catalogue
 from benchmarks._continent import Continent
-from services.formats.images.raster import gdal_rpc
-from services.imagery.catalogue import ImageCatalogue
-from services.imagery.source import Window
-from services.sensors.rpc import RpcModel
-from services.simulation.archive import ArchiveView
-from services.simulation.conditions import clouds_over
-from services.simulation.tiles import TILE_PX
-from services.types import Array
 
 BITS = 12
 _STRIP_LINES = 8 * TILE_PX

@@ -15,22 +15,22 @@ import rasterio
 from rasterio.crs import CRS
 from rasterio.transform import Affine
 
+from amers.services.formats.block.document import BlockMetadata, BlockSpecification, Provenance
+from amers.services.formats.block.writer import write_block
+from amers.services.formats.images.ortho import gdal_transform
+from amers.services.geodesy import box_around, metres_per_degree, move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.map_grid import MapGrid
+from amers.services.simulation.archive import season_of
+from amers.services.simulation.land import WATER
+from amers.services.simulation.light import averaged, day_of, radiance
+from amers.services.simulation.orbit import sun_direction
+from amers.services.simulation.render import digitise
+from amers.services.simulation.view import PLAIN_RADIOMETRY
+from amers.services.simulation.world import World, natural_noise
+from amers.services.types import Array, FloatImage, Frame
 from benchmarks._continent import Continent
 from benchmarks._simulated import lay_points
-from services.formats.block.document import BlockMetadata, BlockSpecification, Provenance
-from services.formats.block.writer import write_block
-from services.formats.images.ortho import gdal_transform
-from services.geodesy import box_around, metres_per_degree, move_metres
-from services.imagery.scene import Scene
-from services.map_grid import MapGrid
-from services.simulation.archive import season_of
-from services.simulation.land import WATER
-from services.simulation.light import averaged, day_of, radiance
-from services.simulation.orbit import sun_direction
-from services.simulation.render import digitise
-from services.simulation.view import PLAIN_RADIOMETRY
-from services.simulation.world import World, natural_noise
-from services.types import Array, FloatImage, Frame
 
 POINT_SIGMA_M = (0.5, 0.5, 0.8)
 FRAME_SIGMA_M, FRAME_SIGMA_UP_M = 0.4, 0.6

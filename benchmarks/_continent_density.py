@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
+from amers.services.geodesy import metres_per_degree
+from amers.services.quality.density import density_cells, share_reaching
+from amers.services.simulation.land import WATER
+from amers.services.simulation.world import World
+from amers.services.types import Array, BoolArray, ControlPoints
 from benchmarks._continent import Continent
-from services.geodesy import metres_per_degree
-from services.quality.density import density_cells, share_reaching
-from services.simulation.land import WATER
-from services.simulation.world import World
-from services.types import Array, BoolArray, ControlPoints
 
 POINTS_PER_KM2 = 0.5
 _PATCH_M = 100.0

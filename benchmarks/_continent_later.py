@@ -5,19 +5,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from amers.services.formats.images.scenes import read_scene
+from amers.services.geodesy import move_metres
+from amers.services.matching.predict import in_image
+from amers.services.registration.options import RegistrationOptions
+from amers.services.simulation.archive import ArchiveView
+from amers.services.simulation.conditions import clouds_over
+from amers.services.simulation.detectors import PERFECT
+from amers.services.simulation.distortion import Distortion
+from amers.services.types import Array, BoolArray, ChipSource, ControlPoints
 from benchmarks._campaign import Outcome, registered
 from benchmarks._continent import Continent
 from benchmarks._point_errors import BlockErrors
 from benchmarks._scenes import Prepared
-from services.formats.images.scenes import read_scene
-from services.geodesy import move_metres
-from services.matching.predict import in_image
-from services.registration.options import RegistrationOptions
-from services.simulation.archive import ArchiveView
-from services.simulation.conditions import clouds_over
-from services.simulation.detectors import PERFECT
-from services.simulation.distortion import Distortion
-from services.types import Array, BoolArray, ChipSource, ControlPoints
 
 CORRECT_M = 3.0
 """Largest horizontal error of a measure that shows its point."""

@@ -15,23 +15,31 @@ from functools import cached_property
 
 import numpy as np
 
+from amers.services.adjustment.intersection import intersect
+from amers.services.formats.images.scenes import read_scene
+from amers.services.geodesy import metres_per_degree_at, move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ImageSource, render_chip
+from amers.services.matching.correlate import FOUND, CorrelationOptions, find_chip
+from amers.services.matching.multi_image import refine_on_chips
+from amers.services.quality.accuracy import accuracy, normalised_error
+from amers.services.quality.normal_law import LINEAR_LE90, normal_ce90
+from amers.services.simulation.archive import ArchiveView
+from amers.services.simulation.orbit import sun_direction
+from amers.services.simulation.render import Radiometry
+from amers.services.simulation.tiles import TiledView
+from amers.services.simulation.view import ViewGeometry
+from amers.services.simulation.world import World, part_of_world
+from amers.services.types import (
+    Array,
+    ChipArray,
+    ChipSource,
+    ControlPoints,
+    Frame,
+    IntArray,
+    Observations,
+)
 from benchmarks._continent import Continent
-from services.adjustment.intersection import intersect
-from services.formats.images.scenes import read_scene
-from services.geodesy import metres_per_degree_at, move_metres
-from services.imagery.scene import Scene
-from services.imagery.source import ImageSource, render_chip
-from services.matching.correlate import FOUND, CorrelationOptions, find_chip
-from services.matching.multi_image import refine_on_chips
-from services.quality.accuracy import accuracy, normalised_error
-from services.quality.normal_law import LINEAR_LE90, normal_ce90
-from services.simulation.archive import ArchiveView
-from services.simulation.orbit import sun_direction
-from services.simulation.render import Radiometry
-from services.simulation.tiles import TiledView
-from services.simulation.view import ViewGeometry
-from services.simulation.world import World, part_of_world
-from services.types import Array, ChipArray, ChipSource, ControlPoints, Frame, IntArray, Observations
 
 _CELL_M = 1_500.0
 _MARGIN_M = 700.0

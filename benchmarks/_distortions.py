@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.simulation.distortion import (
+from amers.services.simulation.distortion import (
     Bend,
     Displacement,
     Distortion,
@@ -15,7 +15,7 @@ from services.simulation.distortion import (
     Turn,
     Waves,
 )
-from services.types import Array
+from amers.services.types import Array
 
 JITTER_PX, SHORTEST_PERIOD_PX, LONGEST_PERIOD = (0.2, 6.0), 100.0, 3.0
 BOW_PX = (1.0, 8.0)

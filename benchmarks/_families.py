@@ -14,6 +14,7 @@ from queue import Empty, Queue
 
 import cv2
 
+from amers.services.registration.options import RegistrationOptions
 from benchmarks._campaign import Outcome, attempt
 from benchmarks._distorted_trials import DISTORTED, distorted_trial
 from benchmarks._distortions import Drawn
@@ -28,7 +29,6 @@ from benchmarks._trials import (
     sensor_trial,
 )
 from benchmarks._worlds import NOMINAL, PLACES, Place, block_of
-from services.registration.options import RegistrationOptions
 
 ROOT = Path(__file__).parent.parent
 OPTIONS = RegistrationOptions(max_points=120)

@@ -5,14 +5,14 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from app.config import Settings
-from app.db import engine
-from app.db.engine import Connection
-from app.db.usage import read_all_usage
-from app.errors import InputError
-from app.storage import Storage
-from app.usecases.backups.manifest import find_problems, read_manifest
-from app.worker.sweep import sweep_files
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.engine import Connection
+from amers.app.db.usage import read_all_usage
+from amers.app.errors import InputError
+from amers.app.storage import Storage
+from amers.app.usecases.backups.manifest import find_problems, read_manifest
+from amers.app.worker.sweep import sweep_files
 from benchmarks._faults_caller import ENDED, Caller
 from benchmarks._killed_installation import LEASE_S, KilledInstallation
 from tests.statements import run_sql

@@ -13,14 +13,14 @@ import numpy as np
 import psycopg
 from rich.console import Console
 
-from app.db import binary_copy as binary
-from app.db import engine
-from app.db.blocks import ID_BITS
-from app.db.engine import Connection
-from app.db.schema import point
-from services.formats.block.hilbert import hilbert_order
-from services.geodesy import metres_per_degree
-from services.types import Array
+from amers.app.db import binary_copy as binary
+from amers.app.db import engine
+from amers.app.db.blocks import ID_BITS
+from amers.app.db.engine import Connection
+from amers.app.db.schema import point
+from amers.services.formats.block.hilbert import hilbert_order
+from amers.services.geodesy import metres_per_degree
+from amers.services.types import Array
 from tests.statements import run_sql
 
 WEST_DEG = -177.0

@@ -6,19 +6,19 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from services.adjustment.parameters import image_parameters
-from services.geodesy import lon_lat_h_from_east_north_up, move_metres
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.joint.measured import MeasuredScene, options_in_block
-from services.matching.control_points import PointMatches
-from services.registration.options import RegistrationOptions
-from services.registration.search import Search, adjust_search
-from services.sensors.base import SensorModel
-from services.sensors.correction import ImageCorrection
-from services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
-from services.simulation.world import World
-from services.types import (
+from amers.services.adjustment.parameters import image_parameters
+from amers.services.geodesy import lon_lat_h_from_east_north_up, move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.joint.measured import MeasuredScene, options_in_block
+from amers.services.matching.control_points import PointMatches
+from amers.services.registration.options import RegistrationOptions
+from amers.services.registration.search import Search, adjust_search
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.correction import ImageCorrection
+from amers.services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
+from amers.services.simulation.world import World
+from amers.services.types import (
     Array,
     BoolArray,
     ControlPoints,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from services.simulation.tiles import TILE_PX, Tiles
+from amers.services.simulation.tiles import TILE_PX, Tiles
 
 _ROOT = Path(__file__).parent.parent
 _DRAWN = ("scenes", "distorted_trials", "distortions", "trials", "worlds")

@@ -17,9 +17,9 @@ from types import TracebackType
 import httpx
 import psycopg
 
-from app.db.cluster.embedded import Cluster
-from app.db.engine import connect
-from app.usecases.tokens import create_token
+from amers.app.db.cluster.embedded import Cluster
+from amers.app.db.engine import connect
+from amers.app.usecases.tokens import create_token
 from tests.service_process import free_port
 
 LEASE_S = 2.0
@@ -53,7 +53,7 @@ class Service:
         if self.process is None and time.monotonic() >= self.rests_until:
             with self.log.open("ab") as output:
                 self.process = subprocess.Popen(
-                    [sys.executable, "-m", "app.cli.main", *self.command],
+                    [sys.executable, "-m", "amers", *self.command],
                     env=self.environment,
                     stdin=subprocess.DEVNULL,
                     stdout=output,
@@ -184,7 +184,7 @@ class KilledInstallation:
     def back_up(self, name: str, kill_after_s: float, is_killed: bool) -> None:
         """Make a backup; one that is killed on the way must not look whole."""
         self.backups.mkdir(exist_ok=True)
-        command = [sys.executable, "-m", "app.cli.main", "db", "backup", str(self.backups / name)]
+        command = [sys.executable, "-m", "amers", "db", "backup", str(self.backups / name)]
         with self.log.open("ab") as output:
             process = subprocess.Popen(
                 command,

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from amers.services.adjustment.parameters import ImageParameters, image_parameters
+from amers.services.geodesy import metres_per_degree
+from amers.services.types import Array, BoolArray, Observations
 from benchmarks.block_coverage import GROUND_M, RELIEF_M, SHAPE, origin, view
-from services.adjustment.parameters import ImageParameters, image_parameters
-from services.geodesy import metres_per_degree
-from services.types import Array, BoolArray, Observations
 
 STEP_M = 2000.0
 """Between images of 4 km, along a pass and across."""

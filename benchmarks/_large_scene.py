@@ -7,19 +7,19 @@ import numpy as np
 import rasterio
 from rasterio.windows import Window as RasterWindow
 
+from amers.services.formats.block.document import BlockMetadata, BlockSpecification, Provenance
+from amers.services.formats.block.writer import write_block
+from amers.services.formats.images.raster import gdal_rpc
+from amers.services.geodesy import metres_per_degree
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ImageSource, Window
+from amers.services.sensors.rpc import RpcModel
+from amers.services.simulation.render import surface_seen
+from amers.services.simulation.tiles import TiledView
+from amers.services.simulation.view import ViewPlan, plan_geometry
+from amers.services.simulation.world import World, make_world
+from amers.services.types import Array, ControlPoints
 from benchmarks._simulated import lay_points
-from services.formats.block.document import BlockMetadata, BlockSpecification, Provenance
-from services.formats.block.writer import write_block
-from services.formats.images.raster import gdal_rpc
-from services.geodesy import metres_per_degree
-from services.imagery.scene import Scene
-from services.imagery.source import ImageSource, Window
-from services.sensors.rpc import RpcModel
-from services.simulation.render import surface_seen
-from services.simulation.tiles import TiledView
-from services.simulation.view import ViewPlan, plan_geometry
-from services.simulation.world import World, make_world
-from services.types import Array, ControlPoints
 
 GSD_M = 0.5
 CHIP_GSD_M = 2.0

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import psycopg
 
-from app.db.cluster.embedded import DATABASE, SUPERUSER
+from amers.app.db.cluster.embedded import DATABASE, SUPERUSER
 from benchmarks._killed_installation import KilledInstallation
 
 LASTS_S = 6.0

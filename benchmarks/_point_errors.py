@@ -4,11 +4,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from amers.services.geodesy import metres_per_degree, move_metres
+from amers.services.quality.normal_law import CIRCULAR_CE90
+from amers.services.types import Array, ControlPoints, Frame, IntArray
 from benchmarks._trials import Trial
 from benchmarks._worlds import FINE_GSD_M
-from services.geodesy import metres_per_degree, move_metres
-from services.quality.normal_law import CIRCULAR_CE90
-from services.types import Array, ControlPoints, Frame, IntArray
 
 LE90_OF_CE90 = 5.0 / 3.0
 """Ratio of the points: 5 m to 3 m in SRP."""

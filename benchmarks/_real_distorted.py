@@ -7,18 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
+from amers.services.imagery.scene import Scene, scene_centre, scene_gsd_m
+from amers.services.matching.predict import in_image
+from amers.services.registration.on_points import Registration
+from amers.services.registration.options import RegistrationOptions
+from amers.services.sensors.rpc import RpcModel
+from amers.services.simulation.distortion import DistortedImage, Distortion
+from amers.services.types import Array
 from benchmarks._campaign import Outcome, outcome_of
 from benchmarks._distorted_trials import DISTORTED
 from benchmarks._distortions import NOT_DISTORTED, Drawn, distortion_of
 from benchmarks._real_views import VIEWS, RealView, real_view
 from benchmarks._scenes import Truth
-from services.imagery.scene import Scene, scene_centre, scene_gsd_m
-from services.matching.predict import in_image
-from services.registration.on_points import Registration
-from services.registration.options import RegistrationOptions
-from services.sensors.rpc import RpcModel
-from services.simulation.distortion import DistortedImage, Distortion
-from services.types import Array
 
 CLEAN = "clean"
 SCENES = {

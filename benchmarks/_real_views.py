@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
+from amers.services.adjustment.intersection import intersect
+from amers.services.formats.images.scenes import read_scene
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, Window
+from amers.services.matching.ground_features import FeatureOptions
+from amers.services.production.from_images import Production, ProductionOptions, produce_points
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Array, BoolArray, ControlPoints, Observations, Views
 from benchmarks._worlds import Block
-from services.adjustment.intersection import intersect
-from services.formats.images.scenes import read_scene
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, Window
-from services.matching.ground_features import FeatureOptions
-from services.production.from_images import Production, ProductionOptions, produce_points
-from services.sensors.base import SensorModel
-from services.sensors.rpc import RpcModel
-from services.types import Array, BoolArray, ControlPoints, Observations, Views
 from tests.journeys.ties import independent_tracks
 
 CHIPS = ProductionOptions(

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.adjustment.control_ground import ControlGround
-from services.adjustment.parameters import AdjustableImage
-from services.geodesy import move_metres
-from services.sensors.base import SensorModel
-from services.types import Array, Frame, IntArray, Observations
+from amers.services.adjustment.control_ground import ControlGround
+from amers.services.adjustment.parameters import AdjustableImage
+from amers.services.geodesy import move_metres
+from amers.services.sensors.base import SensorModel
+from amers.services.types import Array, Frame, IntArray, Observations
 
 EXACT = Frame.from_sigmas(0.0, 0.0)
 

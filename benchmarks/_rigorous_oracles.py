@@ -8,19 +8,19 @@ from xml.etree import ElementTree
 import numpy as np
 import rasterio
 
-from services.formats.sensor_models.dimap_rigorous import parse_dimap_rigorous
-from services.formats.sensor_models.phr_dimap import parse_phr_dimap
-from services.formats.sensor_models.rpc_text import parse_rpc_text
-from services.formats.sensor_models.spot_dimap import parse_spot_dimap
-from services.formats.sensor_models.worldview_isd import parse_worldview_isd
-from services.formats.text_files import read_text
-from services.sensors.attitude import orbital_attitude
-from services.sensors.base import SensorModel
-from services.sensors.light_path import GEOMETRIC, LightPath
-from services.sensors.piecewise import PiecewisePolynomial, lagrange, linear
-from services.sensors.pushbroom import PushbroomModel
-from services.sensors.rpc import RpcModel
-from services.types import Array
+from amers.services.formats.sensor_models.dimap_rigorous import parse_dimap_rigorous
+from amers.services.formats.sensor_models.phr_dimap import parse_phr_dimap
+from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
+from amers.services.formats.sensor_models.spot_dimap import parse_spot_dimap
+from amers.services.formats.sensor_models.worldview_isd import parse_worldview_isd
+from amers.services.formats.text_files import read_text
+from amers.services.sensors.attitude import orbital_attitude
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.light_path import GEOMETRIC, LightPath
+from amers.services.sensors.piecewise import PiecewisePolynomial, lagrange, linear
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Array
 
 METADATA = "rigorous_metadata"
 """The folder of the metadata in the folder of real data."""

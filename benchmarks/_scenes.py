@@ -7,24 +7,24 @@ from functools import partial
 
 import numpy as np
 
+from amers.services.geodesy import metres_per_degree
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ImageSource
+from amers.services.matching.predict import in_image
+from amers.services.sensors.rpc import RpcModel
+from amers.services.simulation.conditions import Conditions
+from amers.services.simulation.defects import Damage, DamagedImage
+from amers.services.simulation.detectors import Detectors
+from amers.services.simulation.distortion import Distortion
+from amers.services.simulation.render import surface_seen
+from amers.services.simulation.tiles import TiledView, Tiles
+from amers.services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
+from amers.services.simulation.world import World, with_smoother_terrain
+from amers.services.types import Array, ControlPoints, IntArray
 from benchmarks._distortions import distortion_of
 from benchmarks._point_errors import BlockErrors, spoil
 from benchmarks._trials import Trial
 from benchmarks._worlds import Block, Place, world_of
-from services.geodesy import metres_per_degree
-from services.imagery.scene import Scene
-from services.imagery.source import ImageSource
-from services.matching.predict import in_image
-from services.sensors.rpc import RpcModel
-from services.simulation.conditions import Conditions
-from services.simulation.defects import Damage, DamagedImage
-from services.simulation.detectors import Detectors
-from services.simulation.distortion import Distortion
-from services.simulation.render import surface_seen
-from services.simulation.tiles import TiledView, Tiles
-from services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
-from services.simulation.world import World, with_smoother_terrain
-from services.types import Array, ControlPoints, IntArray
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from urllib.parse import quote
 
 from psycopg.conninfo import conninfo_to_dict
 
-from app.db.engine import Connection
+from amers.app.db.engine import Connection
 from tests.statements import run_sql
 
 PATIENCE_S = 120.0
@@ -74,7 +74,7 @@ def amers(data_folder: Path) -> Iterator[Server]:
     """`amers serve` without its worker and with public points."""
     settings = {"AMERS_DATA_FOLDER": str(data_folder), "AMERS_PUBLIC_POINTS": "true"}
     port = _free_port()
-    command = [sys.executable, "-m", "app.cli.main", "serve", "--no-worker", "--port", str(port)]
+    command = [sys.executable, "-m", "amers", "serve", "--no-worker", "--port", str(port)]
     page = "limit=10000&f=json"
     tiles = "/collections/points/tiles/WebMercatorQuad"
     with _running(command, settings) as process:

@@ -4,12 +4,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from services.adjustment.intersection import intersect
-from services.imagery.scene import Scene, scene_gsd_m, view_direction
-from services.imagery.source import ImageSource, ReducedImage, reduce_image, render_chip
-from services.matching.multi_image import chip_inside, chip_saliency, refine_on_chips, stored_chip
-from services.simulation.world import World
-from services.types import UNKNOWN_FRAME, Array, ChipArray, ControlPoints, Views
+from amers.services.adjustment.intersection import intersect
+from amers.services.imagery.scene import Scene, scene_gsd_m, view_direction
+from amers.services.imagery.source import ImageSource, ReducedImage, reduce_image, render_chip
+from amers.services.matching.multi_image import chip_inside, chip_saliency, refine_on_chips, stored_chip
+from amers.services.simulation.world import World
+from amers.services.types import UNKNOWN_FRAME, Array, ChipArray, ControlPoints, Views
 
 LEAST_SALIENCY = 0.3
 

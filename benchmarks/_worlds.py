@@ -12,15 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import render_chip
+from amers.services.matching.multi_image import stored_chip
+from amers.services.simulation.render import STEEPEST
+from amers.services.simulation.tiles import TiledView
+from amers.services.simulation.view import ViewPlan, plan_geometry
+from amers.services.simulation.world import World, make_world
+from amers.services.types import UNKNOWN_FRAME, Acquisition, Array, ChipArray, ControlPoints, Views
 from benchmarks._simulated import lay_points
-from services.imagery.scene import Scene
-from services.imagery.source import render_chip
-from services.matching.multi_image import stored_chip
-from services.simulation.render import STEEPEST
-from services.simulation.tiles import TiledView
-from services.simulation.view import ViewPlan, plan_geometry
-from services.simulation.world import World, make_world
-from services.types import UNKNOWN_FRAME, Acquisition, Array, ChipArray, ControlPoints, Views
 
 FINE_GSD_M, COARSE_GSD_M = 2.0, 20.0
 COARSE_REFERENCE_GSD_M = 8.0

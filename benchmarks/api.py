@@ -28,10 +28,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from app.db import engine, revisions
-from app.db.cluster.embedded import DATABASE, SUPERUSER, Cluster
-from app.storage import Storage
-from app.usecases.blocks.lifecycle import ingest_block, publish_block
+from amers.app.db import engine, revisions
+from amers.app.db.cluster.embedded import DATABASE, SUPERUSER, Cluster
+from amers.app.storage import Storage
+from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
 from benchmarks import _servers
 from benchmarks._filled import ROW_BLOCKS, Ground, fill
 from benchmarks._measuring import keep

@@ -22,18 +22,18 @@ from rich.table import Table
 from scipy import sparse
 from scipy.optimize import least_squares as scipy_least_squares
 
+from amers.services.adjustment.block_gauge import Gauge
+from amers.services.adjustment.block_problem import BlockOptions, BlockProblem
+from amers.services.adjustment.block_solution import State, least_squares
+from amers.services.adjustment.bundle import adjust_block
+from amers.services.adjustment.control_ground import NO_CONTROL
+from amers.services.adjustment.normal_equations import Equations
+from amers.services.adjustment.parameters import BlockPriors, ImageParameters, block_priors
+from amers.services.geodesy import metres_per_degree, move_metres
+from amers.services.types import Array, Observations
 from benchmarks._large_block import large_block
 from benchmarks._measuring import keep, memory_mib
 from benchmarks.block_coverage import Case, draw
-from services.adjustment.block_gauge import Gauge
-from services.adjustment.block_problem import BlockOptions, BlockProblem
-from services.adjustment.block_solution import State, least_squares
-from services.adjustment.bundle import adjust_block
-from services.adjustment.control_ground import NO_CONTROL
-from services.adjustment.normal_equations import Equations
-from services.adjustment.parameters import BlockPriors, ImageParameters, block_priors
-from services.geodesy import metres_per_degree, move_metres
-from services.types import Array, Observations
 
 PER_IMAGE = 300
 LOSSES = ("soft_l1", "cauchy")

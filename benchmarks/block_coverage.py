@@ -32,16 +32,16 @@ from rich.progress import track
 from rich.table import Table
 from scipy.stats import chi2
 
+from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
+from amers.services.adjustment.parameters import ImageParameters, image_parameters
+from amers.services.errors import ComputationError
+from amers.services.geodesy import lon_lat_h_from_east_north_up, metres_per_degree
+from amers.services.sensors.correction import no_correction
+from amers.services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
+from amers.services.simulation.world import World, make_world
+from amers.services.types import Array, Observations
 from benchmarks._block_scenes import scene_held
 from benchmarks._measuring import keep
-from services.adjustment.bundle import BlockAdjustment, adjust_block
-from services.adjustment.parameters import ImageParameters, image_parameters
-from services.errors import ComputationError
-from services.geodesy import lon_lat_h_from_east_north_up, metres_per_degree
-from services.sensors.correction import no_correction
-from services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
-from services.simulation.world import World, make_world
-from services.types import Array, Observations
 
 SHAPE = (4000, 4000)
 GROUND_M = 150.0

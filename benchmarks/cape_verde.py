@@ -19,10 +19,10 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from amers.services.quality.site_reach import SiteCheck, SiteReach, site_reach
+from amers.services.types import Array
 from benchmarks._cape_verde import SITES, STEREO, draw
 from benchmarks._measuring import keep
-from services.quality.site_reach import SiteCheck, SiteReach, site_reach
-from services.types import Array
 
 PUBLISHED = {
     ("GVAC", "GVBA"): (67, 0.83, 1.08),

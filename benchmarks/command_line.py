@@ -17,10 +17,10 @@ from statistics import median
 from rich.console import Console
 from rich.table import Table
 
-from app.db import engine, revisions
-from app.db.cluster.embedded import Cluster
-from app.storage import Storage
-from app.usecases.blocks.lifecycle import ingest_block
+from amers.app.db import engine, revisions
+from amers.app.db.cluster.embedded import Cluster
+from amers.app.storage import Storage
+from amers.app.usecases.blocks.lifecycle import ingest_block
 from benchmarks._measuring import keep
 from tests.factories import make_block
 
@@ -74,7 +74,7 @@ def measure(environment: dict[str, str], repeats: int) -> list[Outcome]:
     """Time all commands in turn; the first turn, which compiles modules, is not counted."""
     ways = {BASE: [sys.executable, "-c", "pass"]}
     for command in COMMANDS:
-        ways[f"amers {command}"] = [sys.executable, "-m", "app.cli.main", *command.split()]
+        ways[f"amers {command}"] = [sys.executable, "-m", "amers", *command.split()]
     times: dict[str, list[float]] = {name: [] for name in ways}
     for turn in range(repeats + 1):
         for name, words in ways.items():

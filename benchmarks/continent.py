@@ -27,6 +27,7 @@ import cv2
 import numpy as np
 from rich.console import Console
 
+from amers.services.formats.block.reader import FolderChips, read_block
 from benchmarks._continent import SIZES, Continent, make_truth, open_continent
 from benchmarks._continent_archive import write_archive_catalogue, write_image
 from benchmarks._continent_control import write_control
@@ -34,7 +35,6 @@ from benchmarks._continent_density import judge_density
 from benchmarks._continent_later import never_found, register_later
 from benchmarks._continent_points import judge_points, true_places
 from benchmarks._measuring import keep, memory_mib
-from services.formats.block.reader import FolderChips, read_block
 
 
 def main() -> None:

@@ -28,18 +28,18 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from amers.services.conventions import CHIP_SIZE
+from amers.services.formats.images.raster import open_raster, write_raster
+from amers.services.geodesy import move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ImageSource, render_chip
+from amers.services.matching.control_points import ChipSearch, MatchingOptions, chip_pixels, match_points
+from amers.services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip
+from amers.services.simulation.view import SimulatedView, ViewPlan, simulate_view, true_ground
+from amers.services.simulation.world import World, make_world
+from amers.services.types import Array, ChipArray, ControlPoints, FloatImage
 from benchmarks._measuring import cpu_medians_s, keep
 from benchmarks._simulated import lay_points
-from services.conventions import CHIP_SIZE
-from services.formats.images.raster import open_raster, write_raster
-from services.geodesy import move_metres
-from services.imagery.scene import Scene
-from services.imagery.source import ImageSource, render_chip
-from services.matching.control_points import ChipSearch, MatchingOptions, chip_pixels, match_points
-from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip
-from services.simulation.view import SimulatedView, ViewPlan, simulate_view, true_ground
-from services.simulation.world import World, make_world
-from services.types import Array, ChipArray, ControlPoints, FloatImage
 
 RADIUS_PX = 40
 FARTHEST_PX = 35.0

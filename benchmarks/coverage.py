@@ -31,14 +31,14 @@ from rich.progress import track
 from rich.table import Table
 from scipy.stats import binom
 
+from amers.services.adjustment.control_observations import ControlObservations
+from amers.services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
+from amers.services.errors import ComputationError
+from amers.services.quality.normal_law import normal_ce90
+from amers.services.quality.stability import image_places
+from amers.services.sensors.correction import ImageCorrection, no_correction
+from amers.services.types import Array
 from benchmarks._measuring import keep
-from services.adjustment.control_observations import ControlObservations
-from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
-from services.errors import ComputationError
-from services.quality.normal_law import normal_ce90
-from services.quality.stability import image_places
-from services.sensors.correction import ImageCorrection, no_correction
-from services.types import Array
 
 SHAPE = (4000, 5000)
 GSD_M = 0.5

@@ -26,8 +26,8 @@ from typing import Any
 
 import httpx
 
-from app.storage import Storage
-from app.usecases.blocks.lifecycle import ingest_block, publish_block
+from amers.app.storage import Storage
+from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
 from benchmarks._faults_caller import Caller
 from benchmarks._faults_outcome import IMAGES, POINTS, check_outcome
 from benchmarks._killed_installation import PATIENCE_S, KilledInstallation

@@ -19,13 +19,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from app.db import engine, revisions
-from app.db.cluster.embedded import DATABASE, SUPERUSER, Cluster
-from app.db.engine import Connection
-from app.db.features.bbox import Box
-from app.db.features.collection import Viewer
-from app.usecases.features.items import find_collection, page
-from app.usecases.features.query import FeatureQuery, resolve
+from amers.app.db import engine, revisions
+from amers.app.db.cluster.embedded import DATABASE, SUPERUSER, Cluster
+from amers.app.db.engine import Connection
+from amers.app.db.features.bbox import Box
+from amers.app.db.features.collection import Viewer
+from amers.app.usecases.features.items import find_collection, page
+from amers.app.usecases.features.query import FeatureQuery, resolve
 from benchmarks._filled import Ground, fill
 from benchmarks._measuring import keep
 from tests.statements import run_sql

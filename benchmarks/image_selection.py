@@ -22,18 +22,18 @@ import shapely
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks._catalogue import CENTRE_LON_LAT, KM_PER_DEGREE, SCENE_KM, simulate_catalogue
-from benchmarks._catalogue_files import write_catalogue
-from benchmarks._measuring import keep, memory_mib
-from services.formats.stac.catalogue import read_catalogue
-from services.imagery.catalogue import ImageCatalogue
-from services.production.image_selection import (
+from amers.services.formats.stac.catalogue import read_catalogue
+from amers.services.imagery.catalogue import ImageCatalogue
+from amers.services.production.image_selection import (
     ImageSelection,
     image_steps,
     select_images,
     with_cloud_from_masks,
 )
-from services.types import Array, IntArray
+from amers.services.types import Array, IntArray
+from benchmarks._catalogue import CENTRE_LON_LAT, KM_PER_DEGREE, SCENE_KM, simulate_catalogue
+from benchmarks._catalogue_files import write_catalogue
+from benchmarks._measuring import keep, memory_mib
 
 
 def main() -> None:

@@ -16,12 +16,12 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from app.db import engine, revisions
-from app.db.cluster.embedded import Cluster
-from app.storage import Storage
-from app.usecases.blocks.lifecycle import ingest_block
+from amers.app.db import engine, revisions
+from amers.app.db.cluster.embedded import Cluster
+from amers.app.storage import Storage
+from amers.app.usecases.blocks.lifecycle import ingest_block
+from amers.services.formats.block.check import CHECKSUM_THREADS
 from benchmarks._measuring import keep
-from services.formats.block.check import CHECKSUM_THREADS
 from tests.factories import make_block
 
 IMAGES = 8

@@ -27,10 +27,10 @@ from typing import Any
 import httpx
 import numpy as np
 
-from app.db import engine
-from app.storage import Storage
-from app.usecases.blocks.lifecycle import ingest_block, publish_block
-from app.usecases.tokens import create_token
+from amers.app.db import engine
+from amers.app.storage import Storage
+from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
+from amers.app.usecases.tokens import create_token
 from benchmarks._measuring import keep
 from tests.app.flat_world import SIGMA_M, make_flat_world
 from tests.factories import make_block

@@ -32,16 +32,16 @@ from rasterio.windows import Window as RasterWindow
 from rich.console import Console
 from rich.table import Table
 
+from amers.services.formats.elevation.dem import read_dem
+from amers.services.formats.images.ortho import gdal_transform
+from amers.services.formats.images.raster import gdal_rpc, open_raster
+from amers.services.imagery.scene import Scene
+from amers.services.map_grid import MapGrid
+from amers.services.orthorectification.rectify import OrthoOptions, choose_grid, orthorectify
+from amers.services.sensors.rpc_fit import fit_rpc
+from amers.services.simulation.orbit import pushbroom_over
+from amers.services.types import Acquisition, FloatImage
 from benchmarks._measuring import keep
-from services.formats.elevation.dem import read_dem
-from services.formats.images.ortho import gdal_transform
-from services.formats.images.raster import gdal_rpc, open_raster
-from services.imagery.scene import Scene
-from services.map_grid import MapGrid
-from services.orthorectification.rectify import OrthoOptions, choose_grid, orthorectify
-from services.sensors.rpc_fit import fit_rpc
-from services.simulation.orbit import pushbroom_over
-from services.types import Acquisition, FloatImage
 
 TOLERANCE_PX = 0.125
 GSD_M = 0.5

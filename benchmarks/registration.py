@@ -37,18 +37,18 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from amers.services.formats.block.reader import FolderChips, read_block
+from amers.services.formats.images.scenes import read_scene
+from amers.services.geodesy import metres_per_degree
+from amers.services.matching.control_points import MatchingOptions
+from amers.services.quality.accuracy import accuracy
+from amers.services.registration.on_points import Registration, register_scene
+from amers.services.registration.options import RegistrationOptions
+from amers.services.sensors.correction import CorrectedModel, ImageCorrection
+from amers.services.types import Array
 from benchmarks._beside_arosics import TiePoints, find_tie_points, make_pair, register_pair
 from benchmarks._large_scene import SIGMA_M, make_case
 from benchmarks._measuring import keep, memory_mib
-from services.formats.block.reader import FolderChips, read_block
-from services.formats.images.scenes import read_scene
-from services.geodesy import metres_per_degree
-from services.matching.control_points import MatchingOptions
-from services.quality.accuracy import accuracy
-from services.registration.on_points import Registration, register_scene
-from services.registration.options import RegistrationOptions
-from services.sensors.correction import CorrectedModel, ImageCorrection
-from services.types import Array
 
 SIZES = (5_000, 40_000)
 POINTS, VIEWS = 200, 6

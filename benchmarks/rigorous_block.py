@@ -14,17 +14,17 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from amers.services.adjustment.bundle import adjust_block
+from amers.services.adjustment.parameters import AdjustableImage, image_parameters
+from amers.services.adjustment.rigorous_parameters import rigorous_parameters
+from amers.services.geodesy import lon_lat_h_from_east_north_up
+from amers.services.sensors.parameter_sets import SRP
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.sensors.rpc_fit import fit_rpc
+from amers.services.simulation.orbit import pushbroom_over
+from amers.services.types import Array
 from benchmarks._measuring import keep
 from benchmarks._rigorous_block import Truth, drawn
-from services.adjustment.bundle import adjust_block
-from services.adjustment.parameters import AdjustableImage, image_parameters
-from services.adjustment.rigorous_parameters import rigorous_parameters
-from services.geodesy import lon_lat_h_from_east_north_up
-from services.sensors.parameter_sets import SRP
-from services.sensors.pushbroom import PushbroomModel
-from services.sensors.rpc_fit import fit_rpc
-from services.simulation.orbit import pushbroom_over
-from services.types import Array
 
 PLACE = np.array([-8.0, 31.6, 500.0])
 SHAPE, GSD_M, HEIGHTS_M = (6000, 6000), 1.5, (300.0, 1200.0)

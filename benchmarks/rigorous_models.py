@@ -21,11 +21,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.sensors.rpc_fit import fit_rpc
+from amers.services.simulation.orbit import pushbroom_over
 from benchmarks import _rigorous_oracles as oracles
 from benchmarks._measuring import cpu_medians_s, keep
-from services.sensors.pushbroom import PushbroomModel
-from services.sensors.rpc_fit import fit_rpc
-from services.simulation.orbit import pushbroom_over
 
 HEIGHTS_M = (0.0, 1000.0)
 

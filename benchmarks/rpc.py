@@ -25,11 +25,11 @@ from rasterio.transform import RPCTransformer
 from rich.console import Console
 from rich.table import Table
 
+from amers.services.formats.images.raster import gdal_rpc
+from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Array
 from benchmarks._measuring import cpu_medians_s, keep
-from services.formats.images.raster import gdal_rpc
-from services.formats.sensor_models.rpc_text import parse_rpc_text
-from services.sensors.rpc import RpcModel
-from services.types import Array
 
 MODEL = Path(__file__).parents[1] / "tests" / "golden" / "invented_RPC.TXT"
 GDAL_FIRST_PIXEL = 0.5

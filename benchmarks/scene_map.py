@@ -23,21 +23,21 @@ from rasterio.windows import Window as RasterWindow
 from rich.console import Console
 from rich.table import Table
 
-from app.db import engine, revisions
-from app.db.cluster.embedded import Cluster
-from app.db.jobs import attempts, jobs
-from app.storage import Storage
-from app.usecases.registered_scene import SceneModel
-from app.usecases.scene_map import LAYERS, MappedScene, map_scene
-from app.usecases.tokens import create_token
+from amers.app.db import engine, revisions
+from amers.app.db.cluster.embedded import Cluster
+from amers.app.db.jobs import attempts, jobs
+from amers.app.storage import Storage
+from amers.app.usecases.registered_scene import SceneModel
+from amers.app.usecases.scene_map import LAYERS, MappedScene, map_scene
+from amers.app.usecases.tokens import create_token
+from amers.services.formats.images.raster import gdal_rpc
+from amers.services.formats.sensor_models.correction_json import format_correction
+from amers.services.sensors.correction import ImageCorrection
+from amers.services.sensors.rpc import RpcModel
+from amers.services.sensors.rpc_fit import fit_rpc
+from amers.services.simulation.orbit import pushbroom_over
 from benchmarks import _servers
 from benchmarks._measuring import keep, memory_mib
-from services.formats.images.raster import gdal_rpc
-from services.formats.sensor_models.correction_json import format_correction
-from services.sensors.correction import ImageCorrection
-from services.sensors.rpc import RpcModel
-from services.sensors.rpc_fit import fit_rpc
-from services.simulation.orbit import pushbroom_over
 
 TARGET = (5.25, 44.2, 600.0)
 GSD_M = 0.5

@@ -25,18 +25,18 @@ from typing import Any
 import httpx
 import numpy as np
 
-from app.usecases.image_production import ProductionImages, run_production
-from app.usecases.production import BlockIdentity
-from app.usecases.registration import deliverables, register
-from app.usecases.registration.control_sources import points_of_block
-from app.usecases.registration.register import ControlSources, SceneFiles, run_registration
+from amers.app.usecases.image_production import ProductionImages, run_production
+from amers.app.usecases.production import BlockIdentity
+from amers.app.usecases.registration import deliverables, register
+from amers.app.usecases.registration.control_sources import points_of_block
+from amers.app.usecases.registration.register import ControlSources, SceneFiles, run_registration
+from amers.services.formats.block.reader import FolderChips, read_block
+from amers.services.formats.images.raster import write_raster
+from amers.services.formats.images.scenes import read_scene
+from amers.services.registration.on_points import register_scene
+from amers.services.simulation.view import ViewPlan, simulate_block, simulate_view
+from amers.services.simulation.world import make_world
 from benchmarks._measuring import keep
-from services.formats.block.reader import FolderChips, read_block
-from services.formats.images.raster import write_raster
-from services.formats.images.scenes import read_scene
-from services.registration.on_points import register_scene
-from services.simulation.view import ViewPlan, simulate_block, simulate_view
-from services.simulation.world import make_world
 from tests.service_process import free_port, until
 
 SHAPE = (2000, 2000)
@@ -264,7 +264,7 @@ def _register_all(client: httpx.Client, images: list[Path]) -> None:
 
 def _amers(words: list[str], environment: dict[str, str]) -> str:
     """The standard output of a command that succeeds."""
-    command = [sys.executable, "-m", "app.cli.main", *words]
+    command = [sys.executable, "-m", "amers", *words]
     done = subprocess.run(
         command, env=os.environ | environment, stdout=subprocess.PIPE, text=True, check=True
     )
@@ -273,7 +273,7 @@ def _amers(words: list[str], environment: dict[str, str]) -> str:
 
 @contextmanager
 def _running(words: list[str], environment: dict[str, str]) -> Iterator["subprocess.Popen[bytes]"]:
-    command = [sys.executable, "-m", "app.cli.main", *words]
+    command = [sys.executable, "-m", "amers", *words]
     process = subprocess.Popen(command, env=os.environ | environment, stdin=subprocess.DEVNULL)
     try:
         yield process

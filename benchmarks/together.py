@@ -18,6 +18,17 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from amers.services.imagery.scene import scene_gsd_m
+from amers.services.joint.block import JointBlock
+from amers.services.joint.fitting import adjust_fitting
+from amers.services.joint.registration import qualified
+from amers.services.joint.results import ground_misfits_m
+from amers.services.quality.stability import image_places
+from amers.services.registration.on_points import Registration
+from amers.services.registration.options import RegistrationOptions
+from amers.services.sensors.correction import CorrectedModel
+from amers.services.simulation.world import make_world
+from amers.services.types import Array, Frame
 from benchmarks._joint_scenes import (
     ImagePlan,
     JointTruth,
@@ -29,17 +40,6 @@ from benchmarks._joint_scenes import (
     tie_points,
 )
 from benchmarks._measuring import keep
-from services.imagery.scene import scene_gsd_m
-from services.joint.block import JointBlock
-from services.joint.fitting import adjust_fitting
-from services.joint.registration import qualified
-from services.joint.results import ground_misfits_m
-from services.quality.stability import image_places
-from services.registration.on_points import Registration
-from services.registration.options import RegistrationOptions
-from services.sensors.correction import CorrectedModel
-from services.simulation.world import make_world
-from services.types import Array, Frame
 
 OPTIONS = RegistrationOptions(max_points=0)
 RELIEF_M = 60.0

@@ -18,20 +18,20 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from amers.services.adjustment.block_problem import BlockOptions
+from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
+from amers.services.adjustment.control_ground import ControlGround
+from amers.services.adjustment.intersection import intersect
+from amers.services.adjustment.parameters import AdjustableImage
+from amers.services.adjustment.rigorous_parameters import rigorous_parameters
+from amers.services.geodesy import metres_per_degree_at, move_metres
+from amers.services.sensors.parameter_sets import TOUTIN
+from amers.services.simulation.orbit import pushbroom_over
+from amers.services.types import Array, IntArray, Observations
 from benchmarks._measuring import RESULTS, keep
 from benchmarks._rigorous_block import EXACT, Truth
 from benchmarks._rigorous_block import drawn as drawn_models
 from benchmarks._toutin_figure import draw_figure
-from services.adjustment.block_problem import BlockOptions
-from services.adjustment.bundle import BlockAdjustment, adjust_block
-from services.adjustment.control_ground import ControlGround
-from services.adjustment.intersection import intersect
-from services.adjustment.parameters import AdjustableImage
-from services.adjustment.rigorous_parameters import rigorous_parameters
-from services.geodesy import metres_per_degree_at, move_metres
-from services.sensors.parameter_sets import TOUTIN
-from services.simulation.orbit import pushbroom_over
-from services.types import Array, IntArray, Observations
 
 PLACE = np.array([-75.75, 45.5, 100.0])
 HALF_EXTENT_M = (19_500.0, 27_800.0)

@@ -29,25 +29,25 @@ from rasterio.transform import RPCTransformer
 from rich.console import Console
 from rich.table import Table
 
-from app.usecases.registered_scene import SceneModel
-from app.usecases.terrain_file import TerrainFile, read_terrain
-from app.usecases.vector_files import VectorFile
-from app.usecases.vectors import correct_file
+from amers.app.usecases.registered_scene import SceneModel
+from amers.app.usecases.terrain_file import TerrainFile, read_terrain
+from amers.app.usecases.vector_files import VectorFile
+from amers.app.usecases.vectors import correct_file
+from amers.services.formats.images.raster import gdal_rpc, write_raster
+from amers.services.formats.vector.layers import VectorLayer, read_layer, write_layer
+from amers.services.geodesy import metres_per_degree
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.lines_of_sight import intersect_terrain
+from amers.services.sensors.rpc import RpcModel
+from amers.services.sensors.rpc_fit import fit_rpc
+from amers.services.simulation.orbit import pushbroom_over
+from amers.services.terrain import Terrain
+from amers.services.types import Acquisition, Array, FloatImage
+from amers.services.vectors.accuracy import ErrorSources
+from amers.services.vectors.correct import correct_vectors
+from amers.services.vectors.shapes import Geometries, geometries_of, shapes_of
 from benchmarks._measuring import keep
-from services.formats.images.raster import gdal_rpc, write_raster
-from services.formats.vector.layers import VectorLayer, read_layer, write_layer
-from services.geodesy import metres_per_degree
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.lines_of_sight import intersect_terrain
-from services.sensors.rpc import RpcModel
-from services.sensors.rpc_fit import fit_rpc
-from services.simulation.orbit import pushbroom_over
-from services.terrain import Terrain
-from services.types import Acquisition, Array, FloatImage
-from services.vectors.accuracy import ErrorSources
-from services.vectors.correct import correct_vectors
-from services.vectors.shapes import Geometries, geometries_of, shapes_of
 
 CENTRE = np.array([5.2, 44.2, 900.0])
 GSD_M = 0.5

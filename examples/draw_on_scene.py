@@ -14,13 +14,13 @@ import numpy as np
 import shapely
 import simulated_images
 
-from app.usecases.registered_scene import SceneModel
-from app.usecases.terrain_file import TerrainFile, read_terrain
-from app.usecases.vector_files import CorrectionOptions, VectorFile
-from app.usecases.vectors import correct_file
-from services.formats.vector.layers import read_layer
-from services.geodesy import metres_per_degree
-from services.lines_of_sight import intersect_terrain
+from amers.app.usecases.registered_scene import SceneModel
+from amers.app.usecases.terrain_file import TerrainFile, read_terrain
+from amers.app.usecases.vector_files import CorrectionOptions, VectorFile
+from amers.app.usecases.vectors import correct_file
+from amers.services.formats.vector.layers import read_layer
+from amers.services.geodesy import metres_per_degree
+from amers.services.lines_of_sight import intersect_terrain
 
 DRAWN = {
     "field": {"type": "Polygon", "coordinates": [[[120, 150], [260, 170], [240, 330], [120, 150]]]},

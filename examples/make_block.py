@@ -12,11 +12,11 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import simulated_images
 
-from app.usecases.image_production import ProductionImages, run_production
-from app.usecases.production import BlockIdentity
-from services.formats.block.reader import FolderChips, read_block
-from services.production.from_images import ProductionOptions
-from services.types import point_chips
+from amers.app.usecases.image_production import ProductionImages, run_production
+from amers.app.usecases.production import BlockIdentity
+from amers.services.formats.block.reader import FolderChips, read_block
+from amers.services.production.from_images import ProductionOptions
+from amers.services.types import point_chips
 
 
 def make_block(images: list[Path], folder: Path) -> None:

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import simulated_images
 
-from services.formats.block.reader import FolderChips, read_block
-from services.formats.images.scenes import read_scene
-from services.formats.sensor_models.refined_model import write_refined
-from services.registration.on_points import register_scene
+from amers.services.formats.block.reader import FolderChips, read_block
+from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.sensor_models.refined_model import write_refined
+from amers.services.registration.on_points import register_scene
 
 
 def register(image: Path, block_folder: Path, folder: Path) -> None:

@@ -7,16 +7,16 @@ import numpy as np
 import rasterio
 from rasterio.transform import from_origin
 
-from services.formats.images.raster import write_raster
-from services.sensors.base import SensorModel
-from services.simulation.view import (
+from amers.services.formats.images.raster import write_raster
+from amers.services.sensors.base import SensorModel
+from amers.services.simulation.view import (
     SimulatedView,
     ViewPlan,
     plan_geometry,
     simulate_block,
     simulate_view,
 )
-from services.simulation.world import World, make_world
+from amers.services.simulation.world import World, make_world
 
 SHAPE = (700, 700)
 GSD_M = 1.0

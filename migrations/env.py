@@ -4,7 +4,7 @@ from alembic import context
 from sqlalchemy import create_engine, func, select
 from sqlalchemy.pool import NullPool
 
-from app.db import session
+from amers.app.db import session
 
 UPGRADE_LOCK = 0x616D657273  # "amers"
 

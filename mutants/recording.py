@@ -17,7 +17,7 @@ import pytest
 IMPORT = ""
 """Stands for the tests of lines that run when modules are imported."""
 
-_traced = coverage.Coverage(data_file=None, config_file=False, source=["app", "services"])
+_traced = coverage.Coverage(data_file=None, config_file=False, source=["amers.app", "amers.services"])
 _seconds: dict[str, float] = defaultdict(float)
 _failed: set[str] = set()
 
@@ -70,7 +70,9 @@ def pytest_sessionfinish() -> None:
         of_file = {
             line: sorted(set(tests) - {IMPORT}) for line, tests in data.contexts_by_lineno(name).items()
         }
-        lines[str(Path(name).relative_to(root))] = {line: t for line, t in of_file.items() if t}
+        # `amers` links to the folders in which the files lie.
+        path = Path(name).resolve().relative_to(root)
+        lines[str(path)] = {line: t for line, t in of_file.items() if t}
     seconds = {test: time for test, time in _seconds.items() if test not in _failed}
     document = {"seconds": seconds, "failed": sorted(_failed), "lines": lines}
     Path(os.environ["MUTANTS_RECORD"]).write_text(json.dumps(document))

@@ -118,7 +118,7 @@ class Workplace:
         """Files that import a module, or one that does."""
         found, left = set[str](), [path]
         while left:
-            name = left.pop().removesuffix(".py").replace("/", ".")
+            name = "amers." + left.pop().removesuffix(".py").replace("/", ".")
             new = {user for user, imported in self._imports.items() if name in imported} - found
             found |= new
             left += new

@@ -63,7 +63,7 @@ def library() -> dict[str, list[str]]:
         if any(part.startswith("_") for part in parts):
             continue
         page = parts[1] if len(parts) > 2 else "services"
-        pages.setdefault(page, []).append(".".join(parts))
+        pages.setdefault(page, []).append(".".join(("amers", *parts)))
     return pages
 
 

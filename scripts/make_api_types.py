@@ -11,9 +11,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from app.config import Settings
-from app.main import create_app
-from services.reports.document import report_schema
+from amers.app.config import Settings
+from amers.app.main import create_app
+from amers.services.reports.document import report_schema
 
 FOLDER = Path(__file__).parents[1] / "web" / "source"
 HEAD = "// Types of {what}. Made by scripts/make_api_types.py; do not edit.\n"

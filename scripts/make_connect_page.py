@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from app.api.connect import EXAMPLE, as_markdown
+from amers.app.api.connect import EXAMPLE, as_markdown
 
 PAGE = Path(__file__).parents[1] / "docs" / "connect.md"
 

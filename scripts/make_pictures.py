@@ -57,7 +57,7 @@ def service_of(block: Path) -> Iterator[str]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    amers = [sys.executable, "-m", "app.cli.main"]
+    amers = [sys.executable, "-m", "amers"]
     with tempfile.TemporaryDirectory() as data:
         # Started by root, the database server runs as another user, who has to enter the folder.
         Path(data).chmod(0o711)

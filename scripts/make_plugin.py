@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
-from services.formats.vector.qgis_styles import LAYER_STYLES, as_qml
+from amers.services.formats.vector.qgis_styles import LAYER_STYLES, as_qml
 
 ROOT = Path(__file__).parents[1]
 PLUGIN = ROOT / "qgis_plugin" / "amers"

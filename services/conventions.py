@@ -3,7 +3,7 @@
 **Image.** A position is `line_sample`, (n, 2) float64 pixels. (0, 0) is the *centre* of the first
 pixel; lines grow downwards, samples to the right. The pixel `image[i, j]` covers lines
 `i - 0.5 .. i + 0.5` and samples `j - 0.5 .. j + 0.5`. Files with another origin (GDAL counts from the
-corner, DIMAP v2 from one) are converted in `services.formats` and nowhere else.
+corner, DIMAP v2 from one) are converted in `amers.services.formats` and nowhere else.
 
 **Ground.** A position is `lon_lat_h`, (n, 3): degrees, degrees, metres above the WGS 84 ellipsoid.
 Heights above a geoid are named `orthometric_height_m`.

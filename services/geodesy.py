@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numba import njit
 
-from services.types import Array
+from amers.services.types import Array
 
 WGS84_A = 6378137.0
 WGS84_F = 1.0 / 298.257223563

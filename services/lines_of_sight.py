@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from services.errors import CoverageError
-from services.imagery.resampling import finite_bounds
-from services.imagery.source import ArrayImage
-from services.sensors.base import SensorModel
-from services.terrain import Terrain, bilinear_height
-from services.types import Array, FloatImage
+from amers.services.errors import CoverageError
+from amers.services.imagery.resampling import finite_bounds
+from amers.services.imagery.source import ArrayImage
+from amers.services.sensors.base import SensorModel
+from amers.services.terrain import Terrain, bilinear_height
+from amers.services.types import Array, FloatImage
 
 _TOLERANCE_M = 1e-5
 _BOX_NODES = 17

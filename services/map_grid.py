@@ -7,9 +7,9 @@ import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
-from services.errors import InputError
-from services.geodesy import longitudes_near, metres_per_degree_at
-from services.types import Array, BoolArray
+from amers.services.errors import InputError
+from amers.services.geodesy import longitudes_near, metres_per_degree_at
+from amers.services.types import Array, BoolArray
 
 AUTHORITIES = ("EPSG", "ESRI", "IGNF", "OGC")
 _DIFFERENCE_M = 50.0

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from services.types import Progress, no_progress
+from amers.services.types import Progress, no_progress
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 """What a task returns: arrays by their names."""

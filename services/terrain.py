@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
-from services.errors import CoverageError
-from services.geodesy import metres_per_degree_at
-from services.imagery.source import ArrayImage, ImageSource, Window
-from services.map_grid import MapGrid
-from services.types import Array, FloatImage, IntArray
+from amers.services.errors import CoverageError
+from amers.services.geodesy import metres_per_degree_at
+from amers.services.imagery.source import ArrayImage, ImageSource, Window
+from amers.services.map_grid import MapGrid
+from amers.services.types import Array, FloatImage, IntArray
 
 Geoid = Callable[[Array], Array]
 """Height (n,) of a geoid above the ellipsoid at longitudes and latitudes (n, 2), metres."""

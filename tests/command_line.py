@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from unittest.mock import patch
 
-from app.cli.main import main
+from amers.app.cli.main import main
 
 Done = subprocess.CompletedProcess[str]
 
@@ -36,7 +36,7 @@ def amers_here(words: Sequence[object], environment: Mapping[str, str]) -> Done:
 
 def amers_process(words: Sequence[object], environment: Mapping[str, str]) -> Done:
     """What `amers` with these words does as a process."""
-    command = [sys.executable, "-m", "app.cli.main", *map(str, words)]
+    command = [sys.executable, "-m", "amers", *map(str, words)]
     return subprocess.run(
         command, env=dict(environment), capture_output=True, text=True, timeout=600, check=False
     )

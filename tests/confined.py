@@ -101,7 +101,9 @@ def skip_unless_possible() -> None:
     tried = Confinement({}).run(["true"], {})
     if tried.returncode != 0:
         pytest.skip(f"no process can be confined here: {tried.stderr.strip()}")
-    can_read = Confinement({}).run(["python", "-c", "import app.cli.main"], {"PATH": path_of_amers()})
+    can_read = Confinement({}).run(
+        ["python", "-c", "import amers.app.cli.main"], {"PATH": path_of_amers()}
+    )
     if can_read.returncode != 0:
         pytest.skip("a user without rights cannot read this checkout or its environment")
 

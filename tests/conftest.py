@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-from app.child_processes import SAFE_PATH
+from amers.app.child_processes import SAFE_PATH
 from tests.run_folders import DISK, MEMORY, end_dead_runs, place_of_databases, run_folder
 
 # Until all tests are collected: it would look again and again through modules that live to the end.

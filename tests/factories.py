@@ -8,17 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
-from services.conventions import CHIP_SIZE
-from services.formats.block.document import (
+from amers.services.conventions import CHIP_SIZE
+from amers.services.formats.block.document import (
     AccuracyFigure,
     BlockMetadata,
     BlockSpecification,
     Provenance,
     rectangle,
 )
-from services.formats.block.writer import write_block
-from services.sensors.rpc import RpcModel
-from services.types import UNKNOWN_FRAME, Acquisition, Array, ChipArray, ControlPoints, Views
+from amers.services.formats.block.writer import write_block
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import UNKNOWN_FRAME, Acquisition, Array, ChipArray, ControlPoints, Views
 
 GSDS_M = (0.5, 2.0)
 BOX = (5.2, 43.2, 5.3, 43.3)

@@ -37,7 +37,7 @@ class Importers:
 sys.meta_path.insert(0, Importers())
 atexit.register(lambda: print(json.dumps(Importers.first)))
 """
-COMMAND = "from app.cli.main import main; main()"
+COMMAND = "from amers.app.cli.main import main; main()"
 
 
 def imported_by(statement: str, words: str = "", **environment: str) -> dict[str, str]:

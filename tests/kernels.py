@@ -3,8 +3,8 @@
 Run: python -m tests.kernels
 """
 
-from app.worker.warm_up import warm_up
-from services.registration.on_points import register_scene
+from amers.app.worker.warm_up import warm_up
+from amers.services.registration.on_points import register_scene
 from tests.services.simulated import BLOCK_SIGMA_M, block, spoiled_view
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import httpx
 
-from app.db.cluster.embedded import Cluster
+from amers.app.db.cluster.embedded import Cluster
 
 patience_s = 90.0
 PORTS = range(20_000, 32_000)
@@ -51,7 +51,7 @@ class Service:
         self.log = folder.with_suffix(".log")
         with self.log.open("ab") as output:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "app.cli.main", "serve", "--port", str(self.port), *options],
+                [sys.executable, "-m", "amers", "serve", "--port", str(self.port), *options],
                 env=self.environment,
                 stdout=output,
                 stderr=output,

@@ -6,7 +6,7 @@ from typing import Any
 import psycopg
 from psycopg.rows import DictRow, dict_row
 
-from app.db.engine import Connection, driver
+from amers.app.db.engine import Connection, driver
 
 
 def run_sql(

@@ -17,7 +17,7 @@ import httpx
 import psycopg
 import pytest
 
-from app.db import revisions
+from amers.app.db import revisions
 from tests.app.operators_server import (
     PASSWORD,
     SUPERUSER,

@@ -13,10 +13,10 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from typer.main import get_command
 
-from app.cli.main import app
-from app.config import Settings
-from app.main import create_app
-from app.web import page
+from amers.app.cli.main import app
+from amers.app.config import Settings
+from amers.app.main import create_app
+from amers.app.web import page
 from tests.compose_file import compose, unset_names
 
 ROOT = Path(__file__).parent.parent

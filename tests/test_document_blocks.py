@@ -13,7 +13,7 @@ import pytest
 import typer
 from typer.main import get_command
 
-from app.cli.main import app
+from amers.app.cli.main import app
 from tests.documents import ROOT, blocks_of, command_lines
 
 DOCUMENTS = ("README.md", "docs/guide.md")

@@ -10,8 +10,8 @@ from uuid import uuid4
 import numpy as np
 import pytest
 
-from services.formats.block.reader import read_block
-from services.formats.sensor_models.rpc_files import read_rpc
+from amers.services.formats.block.reader import read_block
+from amers.services.formats.sensor_models.rpc_files import read_rpc
 from tests.service_process import Service, until
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
@@ -75,7 +75,7 @@ def test_points_are_queried_from_a_service_and_drawn(made, open_folder, tmp_path
     service = Service(open_folder / uuid4().hex[:8], "--no-worker", AMERS_PUBLIC_POINTS="true")
     try:
         assert until(service.is_ready), service.log.read_text()
-        run("-m", "app.cli.main", "block", "ingest", made / "block", "--publish", **service.environment)
+        run("-m", "amers", "block", "ingest", made / "block", "--publish", **service.environment)
         points = read_block(made / "block").points
         (west, south), (east, north) = (f(points.lon_lat_h[:, :2], axis=0) for f in (np.min, np.max))
         box = f"{west},{south},{east},{north}"

@@ -16,8 +16,8 @@ import pytest
 import typer
 from typer.main import get_command
 
-from app.cli.main import app
-from app.config import Settings
+from amers.app.cli.main import app
+from amers.app.config import Settings
 from tests.command_line import amers_here
 from tests.composed_sql import Source, read_sources
 
@@ -188,7 +188,7 @@ def test_the_command_tells_its_version():
 @pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda p: p.stem)
 def test_a_benchmark_imports_names_that_exist(path):
     for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.module.split(".")[0] in ("app", "services"):
+        if isinstance(node, ast.ImportFrom) and node.module.startswith("amers."):
             module = import_module(node.module)
             for name in node.names:
                 assert hasattr(module, name.name) or find_spec(f"{node.module}.{name.name}"), name.name
@@ -213,7 +213,7 @@ def walks_over_errors(tree: ast.AST) -> list[int]:
 
 
 def test_one_module_walks_from_error_to_error():
-    """`services.errors` does, which meets each once; other code asks it."""
+    """`amers.services.errors` does, which meets each once; other code asks it."""
     folders = ("app", "services", "migrations", "scripts", "benchmarks", "qgis_plugin", "mutants")
     paths = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
     walking = {path for path in paths if walks_over_errors(ast.parse(path.read_text()))}

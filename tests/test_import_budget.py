@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from app.cli import commands
-from app.cli.on_demand import Command, Tree
-from app.one_thread import ONE_THREAD
+from amers.app.cli import commands
+from amers.app.cli.on_demand import Command, Tree
+from amers.app.one_thread import ONE_THREAD
 from tests.imports import COMMAND, CONNECTION, LISTING, PACKAGES, beyond_budget, imported_by
 
 ROOT = Path(__file__).parent.parent
@@ -39,7 +39,7 @@ def test_a_command_imports_no_more_than_its_budget(words):
 
 
 def test_the_python_client_imports_nothing_of_weight_but_httpx():
-    imported = imported_by("import app.client")
+    imported = imported_by("import amers.app.client")
     assert beyond_budget(imported, {"httpx", "importlib.metadata"}) == {}
     assert "httpx" in imported
 
@@ -47,7 +47,7 @@ def test_the_python_client_imports_nothing_of_weight_but_httpx():
 def test_rows_on_a_pipe_are_printed_without_the_tables_of_terminals():
     program = """
 import sys
-from app.cli.output import show
+from amers.app.cli.output import show
 show([{"number": 7}], as_json=False)
 print("rich" in sys.modules)
 """
@@ -59,7 +59,7 @@ print("rich" in sys.modules)
 def test_linear_algebra_of_a_command_has_one_thread_unless_more_are_asked_for(stated, threads):
     program = """
 import os, sys
-from app.cli.main import main
+from amers.app.cli.main import main
 sys.argv = ["amers", "--version"]
 try:
     main()

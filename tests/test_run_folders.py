@@ -15,7 +15,7 @@ from tests.run_folders import PREFIX, end_dead_runs, processes_in, run_folder
 RUN = """
 import sys
 from pathlib import Path
-from app.db.cluster.embedded import Cluster
+from amers.app.db.cluster.embedded import Cluster
 from tests.run_folders import run_folder
 with run_folder(Path(sys.argv[1])) as folder, Cluster(folder / "postgres", durable=False).lease():
     print(folder, flush=True)

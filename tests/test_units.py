@@ -18,12 +18,12 @@ import httpx
 import psycopg
 import pytest
 
-from app.cli.serve import API_ENDING_S
-from app.cli.supervisor import Child
-from app.config import Settings
-from app.db import engine, revisions, stored_files
-from app.db.cluster import programs
-from app.usecases.tokens import create_token
+from amers.app.cli.serve import API_ENDING_S
+from amers.app.cli.supervisor import Child
+from amers.app.config import Settings
+from amers.app.db import engine, revisions, stored_files
+from amers.app.db.cluster import programs
+from amers.app.usecases.tokens import create_token
 from tests.app.operators_server import PASSWORD, OperatorsServer, running_server
 from tests.confined import NOBODY, owned_folder, skip_unless_possible
 from tests.run_folders import place_of_databases, run_folder

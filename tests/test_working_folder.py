@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from app.child_processes import SAFE_PATH, leave_out_working_folder
-from app.cli.supervisor import Child
-from app.db.features import cql2_process
-from app.usecases.executors import ComputeOptions, open_executor
-from app.worker.warm_process import WarmServer
+from amers.app.child_processes import SAFE_PATH, leave_out_working_folder
+from amers.app.cli.supervisor import Child
+from amers.app.db.features import cql2_process
+from amers.app.usecases.executors import ComputeOptions, open_executor
+from amers.app.worker.warm_process import WarmServer
 from tests.hostile_folder import executed, fill_with_modules
 
 PATIENCE_S = 120.0
@@ -33,7 +33,7 @@ def test_modules_of_the_folder_report_their_import(marker: Path) -> None:
 
 
 def test_a_supervised_process_leaves_the_working_folder_out(marker: Path) -> None:
-    process = Child("child", "import json, numpy, app.cli.serve, services.errors").start()
+    process = Child("child", "import json, numpy, amers.app.cli.serve, amers.services.errors").start()
     assert process.wait(PATIENCE_S) == 0
     assert executed(marker) == []
 

@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
-from app.config import Settings
-from app.storage import Storage, open_storage
+from amers.app.config import Settings
+from amers.app.storage import Storage, open_storage
 
 
 def unproven_storage(settings: Settings) -> Storage:

@@ -12,9 +12,9 @@ from typing import Any, Literal, TypeVar
 from fastapi import Depends
 from fastapi.dependencies.models import Dependant
 
-from app.api.credentials import BASIC, BEARER
-from app.auth import Scope
-from app.config import Settings
+from amers.app.api.credentials import BASIC, BEARER
+from amers.app.auth import Scope
+from amers.app.config import Settings
 
 FURTHER_SCOPES = "x-further-scopes"
 """Member of an operation: the scopes that some of its inputs need in addition to its own."""

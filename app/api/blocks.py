@@ -6,10 +6,10 @@ from uuid import UUID
 from fastapi import APIRouter, Header, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from app.api.body import BINARY_BODY, announced_length
-from app.api.deps import Admin, DatabaseDep, InstallationDep, PointsReader, SettingsDep, UploadTurn
-from app.api.jobs import job_url, status_info
-from app.api.models.blocks import (
+from amers.app.api.body import BINARY_BODY, announced_length
+from amers.app.api.deps import Admin, DatabaseDep, InstallationDep, PointsReader, SettingsDep, UploadTurn
+from amers.app.api.jobs import job_url, status_info
+from amers.app.api.models.blocks import (
     AccuracyRecord,
     BlockQuality,
     BlockRecord,
@@ -18,22 +18,22 @@ from app.api.models.blocks import (
     PublishedBlock,
     UploadedBlock,
 )
-from app.api.models.jobs import StatusInfo
-from app.api.routes import CallerRoute
-from app.api.sent_body import sent_chunks
-from app.auth import is_administrator
-from app.db.blocks import Block
-from app.db.engine import Connection
-from app.db.tokens import Token
-from app.usecases import jobs
-from app.usecases.blocks import lifecycle, uploads
-from app.usecases.blocks.deletion import delete_block
-from app.usecases.blocks.ingestion import INGEST_BLOCK
-from app.usecases.blocks.lifecycle import Published
-from app.usecases.jobs import JobRequest
-from app.usecases.scenes import SentFile
-from services.quality.accuracy_statement import accuracy_document
-from services.quality.block import quality_document
+from amers.app.api.models.jobs import StatusInfo
+from amers.app.api.routes import CallerRoute
+from amers.app.api.sent_body import sent_chunks
+from amers.app.auth import is_administrator
+from amers.app.db.blocks import Block
+from amers.app.db.engine import Connection
+from amers.app.db.tokens import Token
+from amers.app.usecases import jobs
+from amers.app.usecases.blocks import lifecycle, uploads
+from amers.app.usecases.blocks.deletion import delete_block
+from amers.app.usecases.blocks.ingestion import INGEST_BLOCK
+from amers.app.usecases.blocks.lifecycle import Published
+from amers.app.usecases.jobs import JobRequest
+from amers.app.usecases.scenes import SentFile
+from amers.services.quality.accuracy_statement import accuracy_document
+from amers.services.quality.block import quality_document
 
 router = APIRouter(tags=["blocks"], route_class=CallerRoute)
 

@@ -1,8 +1,9 @@
 """Bodies of requests: bounds on their size and their time, and reading them chunk by chunk.
 
 A body is read under the bounds of a caller nobody knows yet, `ANONYMOUS_BODY_BYTES`. A route that has
-authenticated its caller raises the limit (`app.api.routes`); only a route that takes uploads raises it
-to that of uploads. So a route without a word about its body has the small limit, whatever its path.
+authenticated its caller raises the limit (`amers.app.api.routes`); only a route that takes uploads
+raises it to that of uploads. So a route without a word about its body has the small limit, whatever its
+path.
 """
 
 import time
@@ -14,7 +15,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.config import Settings
+from amers.app.config import Settings
 
 ANONYMOUS_BODY_BYTES = 1 << 16
 """Limit of a body whose sender has no token: room for a long polygon."""

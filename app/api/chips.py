@@ -8,17 +8,17 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import StreamingResponse
 from pydantic import BeforeValidator, ConfigDict, Field
 
-from app.api.deps import ChipsDep, DatabaseDep, PointsReader
-from app.api.features import parameter_names
-from app.api.negotiation import FILE_HEADER, NPZ, TIFF, refuse_unknown
-from app.api.routes import CallerRoute
-from app.errors import DamagedFile, InvalidParameter
-from app.storage import StoredChips
-from app.usecases.damage import report_damage
-from app.usecases.features import points
-from app.usecases.features.points import MOST_POINTS_WITH_CHIPS, StackFormat
-from app.usecases.features.query import FeatureFilter
-from services.types import ControlPoints
+from amers.app.api.deps import ChipsDep, DatabaseDep, PointsReader
+from amers.app.api.features import parameter_names
+from amers.app.api.negotiation import FILE_HEADER, NPZ, TIFF, refuse_unknown
+from amers.app.api.routes import CallerRoute
+from amers.app.errors import DamagedFile, InvalidParameter
+from amers.app.storage import StoredChips
+from amers.app.usecases.damage import report_damage
+from amers.app.usecases.features import points
+from amers.app.usecases.features.points import MOST_POINTS_WITH_CHIPS, StackFormat
+from amers.app.usecases.features.query import FeatureFilter
+from amers.services.types import ControlPoints
 
 router = APIRouter(tags=["points"], route_class=CallerRoute)
 

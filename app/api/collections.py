@@ -4,12 +4,12 @@ from typing import Any
 
 from fastapi import APIRouter, Request, Response
 
-from app.api import stac
-from app.api.deps import DatabaseDep, PointsReader, SettingsDep
-from app.api.features import CollectionDep, Format, ViewerDep, viewer_of
-from app.api.json_schemas import geometry_schema, property_schema
-from app.api.models.base import Link
-from app.api.models.documents import (
+from amers.app.api import stac
+from amers.app.api.deps import DatabaseDep, PointsReader, SettingsDep
+from amers.app.api.features import CollectionDep, Format, ViewerDep, viewer_of
+from amers.app.api.json_schemas import geometry_schema, property_schema
+from amers.app.api.models.base import Link
+from amers.app.api.models.documents import (
     CollectionDescription,
     Collections,
     Extent,
@@ -17,7 +17,7 @@ from app.api.models.documents import (
     SpatialExtent,
     TemporalExtent,
 )
-from app.api.negotiation import (
+from amers.app.api.negotiation import (
     DOCUMENTS,
     FEATURES,
     GEOJSON,
@@ -30,15 +30,15 @@ from app.api.negotiation import (
     json_reply,
     refuse_unknown,
 )
-from app.api.pages import Cell, Page, document_page, drawn
-from app.api.routes import CallerRoute
-from app.db.engine import Connection
-from app.db.features.collection import Collection, Viewer
-from app.db.features.crs import CRS84
-from app.db.features.instants import format_moment
-from app.errors import NotAllowed
-from app.usecases.features import items
-from app.usecases.features.tiles import TILED
+from amers.app.api.pages import Cell, Page, document_page, drawn
+from amers.app.api.routes import CallerRoute
+from amers.app.db.engine import Connection
+from amers.app.db.features.collection import Collection, Viewer
+from amers.app.db.features.crs import CRS84
+from amers.app.db.features.instants import format_moment
+from amers.app.errors import NotAllowed
+from amers.app.usecases.features import items
+from amers.app.usecases.features.tiles import TILED
 
 router = APIRouter(tags=["collections"], route_class=CallerRoute)
 

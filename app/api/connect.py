@@ -9,9 +9,9 @@ from typing import Literal
 
 from fastapi import APIRouter, Request, Response
 
-from app.api.negotiation import refuse_unknown
-from app.api.pages import Page, document_page
-from app.api.routes import CallerRoute
+from amers.app.api.negotiation import refuse_unknown
+from amers.app.api.pages import Page, document_page
+from amers.app.api.routes import CallerRoute
 
 router = APIRouter(include_in_schema=False, route_class=CallerRoute)
 
@@ -157,7 +157,7 @@ print(points[["saliency", "n_views", "geometry"]])
                 """
 from os import environ
 
-from app.client import Client
+from amers.app.client import Client
 
 with Client("BASE", environ["TOKEN"]) as client:
     points = list(client.points((5.22, 43.21, 5.27, 43.26)))

@@ -11,8 +11,8 @@ from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-from app.api.open_connections import Connections
-from app.config import Settings
+from amers.app.api.open_connections import Connections
+from amers.app.config import Settings
 
 MOST_HEAD_BYTES = 1 << 16
 """Limit of what arrives beside bodies: a head, trailers, sizes of chunks."""

@@ -5,7 +5,7 @@ Source: Fetch Standard of WHATWG, CORS protocol.
 
 from typing import Any
 
-from app.config import Settings
+from amers.app.config import Settings
 
 METHODS = ("DELETE", "GET", "HEAD", "OPTIONS", "PATCH", "POST", "PUT")
 EXPOSED = (

@@ -20,8 +20,8 @@ from fastapi import Request
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 
-from app.api.session_cookie import COOKIE
-from app.errors import NotAllowed
+from amers.app.api.session_cookie import COOKIE
+from amers.app.errors import NotAllowed
 
 BEARER: Literal["bearer"] = "bearer"
 BASIC: Literal["basic"] = "basic"

@@ -11,13 +11,13 @@ from typing import Annotated
 from fastapi import Depends, Request
 from starlette.concurrency import run_in_threadpool
 
-from app import request_context
-from app.api.access import needs
-from app.api.body import body_of
-from app.api.credentials import BASIC, credentials_of, refuse_other_sites, session_of
-from app.api.session_cookie import ENDED_SESSION, Session, parse_session
-from app.api.turns import Turns
-from app.auth import (
+from amers.app import request_context
+from amers.app.api.access import needs
+from amers.app.api.body import body_of
+from amers.app.api.credentials import BASIC, credentials_of, refuse_other_sites, session_of
+from amers.app.api.session_cookie import ENDED_SESSION, Session, parse_session
+from amers.app.api.turns import Turns
+from amers.app.auth import (
     Scope,
     authenticate,
     authenticate_identity,
@@ -25,14 +25,14 @@ from app.auth import (
     require,
     require_token,
 )
-from app.config import Settings
-from app.db.engine import Database
-from app.db.tokens import Token
-from app.errors import NotAllowed
-from app.oidc import Issuer, looks_like_jwt
-from app.storage import Storage, StoredChips
-from app.usecases.features.items import page_secret
-from app.usecases.installation import Installation
+from amers.app.config import Settings
+from amers.app.db.engine import Database
+from amers.app.db.tokens import Token
+from amers.app.errors import NotAllowed
+from amers.app.oidc import Issuer, looks_like_jwt
+from amers.app.storage import Storage, StoredChips
+from amers.app.usecases.features.items import page_secret
+from amers.app.usecases.installation import Installation
 
 UPLOADS_AT_ONCE = 32
 UPLOADS_PER_CALLER = 8

@@ -11,8 +11,8 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
-from app.api.credentials import challenges
-from app.errors import (
+from amers.app.api.credentials import challenges
+from amers.app.errors import (
     AmersError,
     ComputationError,
     Conflict,
@@ -27,9 +27,9 @@ from app.errors import (
     TooLarge,
     TooMany,
 )
-from app.json_values import usable
-from app.outages import outage_of
-from app.usecases.damage import report_damage
+from amers.app.json_values import usable
+from amers.app.outages import outage_of
+from amers.app.usecases.damage import report_damage
 
 PROBLEM_JSON = "application/problem+json"
 HTTP_STATUS: dict[type[Exception], int] = {

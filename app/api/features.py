@@ -9,10 +9,10 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from app.api.access import needs
-from app.api.deps import CallerDep, DatabaseDep, SecretDep, SettingsDep
-from app.api.disposition import disposition
-from app.api.negotiation import (
+from amers.app.api.access import needs
+from amers.app.api.deps import CallerDep, DatabaseDep, SecretDep, SettingsDep
+from amers.app.api.disposition import disposition
+from amers.app.api.negotiation import (
     CRS_HEADER,
     FEATURES,
     FILE_HEADER,
@@ -23,17 +23,17 @@ from app.api.negotiation import (
     header,
     refuse_unknown,
 )
-from app.api.pages import Page, count_text, features_page
-from app.api.routes import CallerRoute
-from app.api.streams import Streamed
-from app.auth import Scope, is_administrator, require
-from app.db.engine import Database
-from app.db.features.collection import Collection, Viewer
-from app.db.features.pages import TextFormat
-from app.usecases.features import items as features
-from app.usecases.features.items import FeaturePage
-from app.usecases.features.query import FeatureQuery, ResolvedQuery, Restriction, resolve
-from services.formats.vector.feature_files import (
+from amers.app.api.pages import Page, count_text, features_page
+from amers.app.api.routes import CallerRoute
+from amers.app.api.streams import Streamed
+from amers.app.auth import Scope, is_administrator, require
+from amers.app.db.engine import Database
+from amers.app.db.features.collection import Collection, Viewer
+from amers.app.db.features.pages import TextFormat
+from amers.app.usecases.features import items as features
+from amers.app.usecases.features.items import FeaturePage
+from amers.app.usecases.features.query import FeatureQuery, ResolvedQuery, Restriction, resolve
+from amers.services.formats.vector.feature_files import (
     FeatureTable,
     format_flatgeobuf,
     format_geopackage,

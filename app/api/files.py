@@ -7,14 +7,14 @@ from email.utils import formatdate
 from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 
-from app.api.conditions import may_send_range
-from app.api.disposition import disposition
-from app.api.error_responses import problem
-from app.api.methods import HEAD
-from app.api.ranges import Part, content_range, multipart, wanted_ranges
-from app.errors import DamagedFile
-from app.storage import FileState, Storage
-from app.usecases.damage import named_by_row
+from amers.app.api.conditions import may_send_range
+from amers.app.api.disposition import disposition
+from amers.app.api.error_responses import problem
+from amers.app.api.methods import HEAD
+from amers.app.api.ranges import Part, content_range, multipart, wanted_ranges
+from amers.app.errors import DamagedFile
+from amers.app.storage import FileState, Storage
+from amers.app.usecases.damage import named_by_row
 
 PIECE_BYTES = 1 << 20
 PAGE_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"

@@ -3,11 +3,11 @@
 from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 
-from app.api.deps import Admin, DatabaseDep
-from app.api.models.features import PointHistoryRecord
-from app.api.paths import PathNumber
-from app.api.routes import CallerRoute
-from app.usecases import history
+from amers.app.api.deps import Admin, DatabaseDep
+from amers.app.api.models.features import PointHistoryRecord
+from amers.app.api.paths import PathNumber
+from amers.app.api.routes import CallerRoute
+from amers.app.usecases import history
 
 router = APIRouter(prefix="/points", tags=["points"], route_class=CallerRoute)
 

@@ -12,8 +12,8 @@ from urllib.parse import urlsplit
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from app.api.error_responses import problem
-from app.config import Settings
+from amers.app.api.error_responses import problem
+from amers.app.config import Settings
 
 HOST = re.compile(r"([A-Za-z0-9._~\-]+|\[[0-9A-Fa-f:.]+\])(:[0-9]*)?")
 LOOPBACK = ("localhost", "127.0.0.1", "::1")

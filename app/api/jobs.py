@@ -7,19 +7,19 @@ from uuid import UUID
 from fastapi import APIRouter, BackgroundTasks, Depends, Query, Request
 from pydantic import BaseModel, Field
 
-from app.api.deps import DatabaseDep, Reader, StorageDep
-from app.api.models.base import Link, stated_accuracy
-from app.api.models.jobs import JobError, Jobs, Message, Messages, StatusInfo
-from app.api.negotiation import JSON
-from app.api.routes import CallerRoute
-from app.db.features.instants import first_instant, last_instant, parse_interval
-from app.db.jobs.jobs import Job, JobFilter
-from app.db.schema import JobState
-from app.errors import NoSuchJob
-from app.usecases import jobs, results
-from app.usecases.media_types import media_type
-from app.usecases.processes import results_folder
-from app.usecases.results import delete_removed
+from amers.app.api.deps import DatabaseDep, Reader, StorageDep
+from amers.app.api.models.base import Link, stated_accuracy
+from amers.app.api.models.jobs import JobError, Jobs, Message, Messages, StatusInfo
+from amers.app.api.negotiation import JSON
+from amers.app.api.routes import CallerRoute
+from amers.app.db.features.instants import first_instant, last_instant, parse_interval
+from amers.app.db.jobs.jobs import Job, JobFilter
+from amers.app.db.schema import JobState
+from amers.app.errors import NoSuchJob
+from amers.app.usecases import jobs, results
+from amers.app.usecases.media_types import media_type
+from amers.app.usecases.processes import results_folder
+from amers.app.usecases.results import delete_removed
 
 router = APIRouter(tags=["jobs"], route_class=CallerRoute)
 

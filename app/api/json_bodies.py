@@ -7,8 +7,8 @@ from email.message import Message
 
 from starlette.exceptions import HTTPException
 
-from app.api.negotiation import JSON
-from app.json_values import unusable_body
+from amers.app.api.negotiation import JSON
+from amers.app.json_values import unusable_body
 
 CHARSETS = ("utf-8", "utf8", "us-ascii")
 SEND = f"send JSON with the header Content-Type: {JSON}"

@@ -5,7 +5,7 @@ Sources: RFC 7946; OGC 17-069r4 (Features); OGC 23-058 (Features - Part 5, schem
 
 from typing import Any
 
-from app.db.features.collection import Collection, Property
+from amers.app.db.features.collection import Collection, Property
 
 Schema = dict[str, Any]
 

@@ -8,7 +8,7 @@ from fastapi.routing import iter_route_contexts
 from starlette.exceptions import HTTPException
 from starlette.types import Scope
 
-from app.api.public_address import own_path
+from amers.app.api.public_address import own_path
 
 HEAD = "amers.head"
 """In the scope of a HEAD that an endpoint of GET serves: the endpoint sees a GET."""

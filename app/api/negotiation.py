@@ -6,8 +6,8 @@ from typing import Any
 from fastapi import Request, Response
 from fastapi.responses import JSONResponse
 
-from app.api.models.base import Reply
-from app.errors import InvalidParameter
+from amers.app.api.models.base import Reply
+from amers.app.errors import InvalidParameter
 
 GEOJSON = "application/geo+json"
 JSON = "application/json"

@@ -6,7 +6,7 @@ from collections import Counter
 from ipaddress import IPv6Address, ip_address, ip_network
 from typing import Protocol
 
-from app.config import Settings
+from amers.app.config import Settings
 
 SILENT_S = 60.0
 """Shortest time between two warnings that the service has too many connections."""

@@ -10,17 +10,17 @@ from fastapi.openapi.utils import get_openapi
 from fastapi.routing import APIRoute
 from pydantic.json_schema import models_json_schema
 
-from app.api.access import declared_security, either_scheme
-from app.api.credentials import BASIC, BEARER
-from app.api.json_schemas import collection_schemas, property_schema, reference, schema_name
-from app.api.models.base import Link, Problem
-from app.api.negotiation import DOCUMENTS, FEATURES, GEOJSON, HTML, JSON, PROBLEM_JSON
-from app.api.openapi_30 import as_openapi_30
-from app.auth import Scope
-from app.config import Settings
-from app.db.features.collection import Collection, Property
-from app.usecases.features.items import COLLECTIONS
-from app.usecases.features.tiles import MATRIX_SET, MOST_ZOOM, TILED
+from amers.app.api.access import declared_security, either_scheme
+from amers.app.api.credentials import BASIC, BEARER
+from amers.app.api.json_schemas import collection_schemas, property_schema, reference, schema_name
+from amers.app.api.models.base import Link, Problem
+from amers.app.api.negotiation import DOCUMENTS, FEATURES, GEOJSON, HTML, JSON, PROBLEM_JSON
+from amers.app.api.openapi_30 import as_openapi_30
+from amers.app.auth import Scope
+from amers.app.config import Settings
+from amers.app.db.features.collection import Collection, Property
+from amers.app.usecases.features.items import COLLECTIONS
+from amers.app.usecases.features.tiles import MATRIX_SET, MOST_ZOOM, TILED
 
 REFUSED = {
     "description": "The request cannot be served; problem details say why.",

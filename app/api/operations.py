@@ -9,13 +9,13 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from prometheus_client.registry import Collector
 
-from app.api.deps import Admin, DatabaseDep, MetricsReader, SettingsDep
-from app.api.models.administration import ChangeRecord, ChangeRecords, InstallationStatus
-from app.api.models.base import Link
-from app.api.negotiation import JSON
-from app.api.routes import CallerRoute
-from app.usecases import operations
-from app.usecases.operations import InstallationFigures
+from amers.app.api.deps import Admin, DatabaseDep, MetricsReader, SettingsDep
+from amers.app.api.models.administration import ChangeRecord, ChangeRecords, InstallationStatus
+from amers.app.api.models.base import Link
+from amers.app.api.negotiation import JSON
+from amers.app.api.routes import CallerRoute
+from amers.app.usecases import operations
+from amers.app.usecases.operations import InstallationFigures
 
 router = APIRouter(tags=["operations"], route_class=CallerRoute)
 

@@ -6,7 +6,7 @@ from typing import Any
 from fastapi import Request
 from fastapi.responses import HTMLResponse
 
-from app.api.pages import Page, document_page
+from amers.app.api.pages import Page, document_page
 
 BOUNDS = {
     "minimum": "at least {}",

@@ -8,12 +8,12 @@ from fastapi import Request
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment, PackageLoader
 
-from app.api.models.base import Link
-from app.api.session_cookie import COOKIE
-from app.db.features.collection import Collection
-from app.usecases.features.items import FeaturePage
+from amers.app.api.models.base import Link
+from amers.app.api.session_cookie import COOKIE
+from amers.app.db.features.collection import Collection
+from amers.app.usecases.features.items import FeaturePage
 
-TEMPLATES = Environment(loader=PackageLoader("app.api", "templates"), autoescape=True)
+TEMPLATES = Environment(loader=PackageLoader("amers.app.api", "templates"), autoescape=True)
 POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; img-src 'self' data:; form-action 'self'; "
     "frame-ancestors 'none'"

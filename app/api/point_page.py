@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from fastapi import Request
 from fastapi.responses import HTMLResponse
 
-from app.api.pages import Page, document_page
-from app.db.point_detail import PointDetail, PointView
-from app.usecases.features.points import point_accuracy
+from amers.app.api.pages import Page, document_page
+from amers.app.db.point_detail import PointDetail, PointView
+from amers.app.usecases.features.points import point_accuracy
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,11 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 
-from app.api.conditions import tag_of
-from app.api.deps import ChipsDep, DatabaseDep, PointsReader
-from app.api.features import CrsUri, Format
-from app.api.models.features import PointWithViews
-from app.api.negotiation import (
+from amers.app.api.conditions import tag_of
+from amers.app.api.deps import ChipsDep, DatabaseDep, PointsReader
+from amers.app.api.features import CrsUri, Format
+from amers.app.api.models.features import PointWithViews
+from amers.app.api.negotiation import (
     CRS_HEADER,
     FILE_HEADER,
     GEOJSON,
@@ -24,22 +24,22 @@ from app.api.negotiation import (
     described,
     refuse_unknown,
 )
-from app.api.paths import PathNumber
-from app.api.point_page import point_page
-from app.api.routes import CallerRoute
-from app.db.features.collection import Viewer
-from app.db.features.instants import format_moment
-from app.db.point_detail import PointDetail, PointView
-from app.db.points import POINTS
-from app.usecases.features import points
-from app.usecases.features.items import find_feature
-from services.formats.chips.images import (
+from amers.app.api.paths import PathNumber
+from amers.app.api.point_page import point_page
+from amers.app.api.routes import CallerRoute
+from amers.app.db.features.collection import Viewer
+from amers.app.db.features.instants import format_moment
+from amers.app.db.point_detail import PointDetail, PointView
+from amers.app.db.points import POINTS
+from amers.app.usecases.features import points
+from amers.app.usecases.features.items import find_feature
+from amers.services.formats.chips.images import (
     format_chip_png,
     format_chip_tiff,
     format_chips_npz,
     format_sheet_png,
 )
-from services.quality.accuracy_statement import accuracy_document
+from amers.services.quality.accuracy_statement import accuracy_document
 
 router = APIRouter(prefix="/collections/points/items", tags=["points"], route_class=CallerRoute)
 

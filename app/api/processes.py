@@ -5,11 +5,11 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Header, Query, Request, Response, status
 from pydantic import BaseModel, ConfigDict, Field
 
-from app.api.access import FURTHER_SCOPES, Public
-from app.api.deps import InstallationDep, Reader
-from app.api.jobs import job_url, status_info
-from app.api.models.base import Link
-from app.api.models.jobs import (
+from amers.app.api.access import FURTHER_SCOPES, Public
+from amers.app.api.deps import InstallationDep, Reader
+from amers.app.api.jobs import job_url, status_info
+from amers.app.api.models.base import Link
+from amers.app.api.models.jobs import (
     InputDescription,
     OutputDescription,
     ProcessDescription,
@@ -17,13 +17,13 @@ from app.api.models.jobs import (
     ProcessSummary,
     StatusInfo,
 )
-from app.api.negotiation import JSON
-from app.api.routes import CallerRoute
-from app.errors import InputError
-from app.usecases import jobs
-from app.usecases.jobs import JobRequest
-from app.usecases.media_types import media_type
-from app.usecases.processes import Process
+from amers.app.api.negotiation import JSON
+from amers.app.api.routes import CallerRoute
+from amers.app.errors import InputError
+from amers.app.usecases import jobs
+from amers.app.usecases.jobs import JobRequest
+from amers.app.usecases.media_types import media_type
+from amers.app.usecases.processes import Process
 
 router = APIRouter(tags=["processes"], route_class=CallerRoute)
 

@@ -12,8 +12,8 @@ from starlette.datastructures import Headers
 from starlette.requests import Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from app.public_url import DEFAULT_PORTS
-from app.usecases.readiness import OK, Part
+from amers.app.public_url import DEFAULT_PORTS
+from amers.app.usecases.readiness import OK, Part
 
 MOST_SHOWN = 200
 

@@ -2,11 +2,11 @@
 
 from fastapi import APIRouter
 
-from app.api.deps import Admin, DatabaseDep, Registrar, SettingsDep
-from app.api.models.administration import Reference, References
-from app.api.routes import CallerRoute
-from app.usecases import references
-from app.usecases.references import NewReference
+from amers.app.api.deps import Admin, DatabaseDep, Registrar, SettingsDep
+from amers.app.api.models.administration import Reference, References
+from amers.app.api.routes import CallerRoute
+from amers.app.usecases import references
+from amers.app.usecases.references import NewReference
 
 router = APIRouter(prefix="/references", tags=["references"], route_class=CallerRoute)
 

@@ -4,9 +4,9 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.api.credentials import browser_may_have_added
-from app.api.session_cookie import ENDED_SESSION, removal
-from app.config import Settings
+from amers.app.api.credentials import browser_may_have_added
+from amers.app.api.session_cookie import ENDED_SESSION, removal
+from amers.app.config import Settings
 
 NO_STORE = "no-store"
 FIRST_ERROR = 400

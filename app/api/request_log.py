@@ -9,7 +9,7 @@ from prometheus_client import CollectorRegistry, Histogram
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.request_context import Origin, working_for
+from amers.app.request_context import Origin, working_for
 
 HEADER = b"x-request-id"
 ACCEPTED_ID = re.compile(rb"[A-Za-z0-9._\-]{1,64}")

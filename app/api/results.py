@@ -9,22 +9,22 @@ from fastapi import APIRouter, Request, Response
 from fastapi.encoders import jsonable_encoder
 from fastapi.responses import JSONResponse
 
-from app import errors
-from app.api.access import Public
-from app.api.deps import DatabaseDep, Reader, StorageDep
-from app.api.error_responses import HTTP_STATUS, OGC_EXCEPTIONS, problem
-from app.api.files import file_reply
-from app.api.jobs import JobId, job_url
-from app.api.models.jobs import ResultFile
-from app.api.negotiation import JSON, SCHEMA_JSON
-from app.api.routes import CallerRoute
-from app.db.jobs.jobs import Job
-from app.errors import AmersError
-from app.storage import Storage
-from app.usecases import jobs, results
-from app.usecases.media_types import media_type
-from services import errors as errors_of_science
-from services.reports import document
+from amers.app import errors
+from amers.app.api.access import Public
+from amers.app.api.deps import DatabaseDep, Reader, StorageDep
+from amers.app.api.error_responses import HTTP_STATUS, OGC_EXCEPTIONS, problem
+from amers.app.api.files import file_reply
+from amers.app.api.jobs import JobId, job_url
+from amers.app.api.models.jobs import ResultFile
+from amers.app.api.negotiation import JSON, SCHEMA_JSON
+from amers.app.api.routes import CallerRoute
+from amers.app.db.jobs.jobs import Job
+from amers.app.errors import AmersError
+from amers.app.storage import Storage
+from amers.app.usecases import jobs, results
+from amers.app.usecases.media_types import media_type
+from amers.services import errors as errors_of_science
+from amers.services.reports import document
 
 router = APIRouter(tags=["jobs"], route_class=CallerRoute)
 

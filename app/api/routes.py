@@ -15,18 +15,18 @@ from starlette.concurrency import run_in_threadpool
 from starlette.routing import Match
 from starlette.types import Receive, Scope, Send
 
-from app import reserve
-from app.api import deps
-from app.api.body import ANONYMOUS_BODY_BYTES, body_of
-from app.api.conditions import answer_conditions
-from app.api.json_bodies import refuse_no_json
-from app.api.methods import HEAD, allowed_methods, reply_to_other_method, without_body
-from app.api.negotiation import NEGOTIATED
-from app.api.open_connections import network_of
-from app.api.streams import Streamed
-from app.api.turns import Turns
-from app.config import Settings
-from app.db.tokens import Token
+from amers.app import reserve
+from amers.app.api import deps
+from amers.app.api.body import ANONYMOUS_BODY_BYTES, body_of
+from amers.app.api.conditions import answer_conditions
+from amers.app.api.json_bodies import refuse_no_json
+from amers.app.api.methods import HEAD, allowed_methods, reply_to_other_method, without_body
+from amers.app.api.negotiation import NEGOTIATED
+from amers.app.api.open_connections import network_of
+from amers.app.api.streams import Streamed
+from amers.app.api.turns import Turns
+from amers.app.config import Settings
+from amers.app.db.tokens import Token
 
 Handler = Callable[[Request], Coroutine[Any, Any, Response]]
 Reply = Callable[[], Coroutine[Any, Any, Response]]

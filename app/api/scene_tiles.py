@@ -4,15 +4,15 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Response
 
-from app.api.deps import DatabaseDep, Reader, StorageDep
-from app.api.jobs import JobId
-from app.api.paths import PathNumber
-from app.api.routes import CallerRoute
-from app.api.tiles import refuse_other_matrix_set
-from app.usecases import jobs
-from app.usecases.scene_map import Layer, scene_tile
-from services.formats.images.map_tiles import tile_media_type
-from services.orthorectification.tile_limits import TilePlace
+from amers.app.api.deps import DatabaseDep, Reader, StorageDep
+from amers.app.api.jobs import JobId
+from amers.app.api.paths import PathNumber
+from amers.app.api.routes import CallerRoute
+from amers.app.api.tiles import refuse_other_matrix_set
+from amers.app.usecases import jobs
+from amers.app.usecases.scene_map import Layer, scene_tile
+from amers.services.formats.images.map_tiles import tile_media_type
+from amers.services.orthorectification.tile_limits import TilePlace
 
 
 async def _place(matrix_set: str, z: PathNumber, y: PathNumber, x: PathNumber) -> TilePlace:

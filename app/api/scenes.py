@@ -10,23 +10,30 @@ from uuid import UUID
 from fastapi import APIRouter, BackgroundTasks, Query, Request, Response, status
 from pydantic import BaseModel, Field
 
-from app.api.body import BINARY_BODY, announced_length
-from app.api.conditions import is_conditional, refuse_change
-from app.api.deps import DatabaseDep, InstallationDep, Registrar, SettingsDep, StorageDep, UploadTurn
-from app.api.files import file_reply, validators
-from app.api.models import scenes as models
-from app.api.models.base import stated_accuracy
-from app.api.models.scenes import Scene, Scenes, StoredFile
-from app.api.routes import CallerRoute
-from app.api.sent_body import sent_chunks
-from app.db.scene_registrations import SceneRegistration
-from app.db.scenes import SceneRow
-from app.db.tokens import Token
-from app.errors import InputError, NotFound
-from app.usecases import scenes
-from app.usecases.features.stac import scene_media_type
-from app.usecases.installation import Installation
-from app.usecases.scenes import SentFile
+from amers.app.api.body import BINARY_BODY, announced_length
+from amers.app.api.conditions import is_conditional, refuse_change
+from amers.app.api.deps import (
+    DatabaseDep,
+    InstallationDep,
+    Registrar,
+    SettingsDep,
+    StorageDep,
+    UploadTurn,
+)
+from amers.app.api.files import file_reply, validators
+from amers.app.api.models import scenes as models
+from amers.app.api.models.base import stated_accuracy
+from amers.app.api.models.scenes import Scene, Scenes, StoredFile
+from amers.app.api.routes import CallerRoute
+from amers.app.api.sent_body import sent_chunks
+from amers.app.db.scene_registrations import SceneRegistration
+from amers.app.db.scenes import SceneRow
+from amers.app.db.tokens import Token
+from amers.app.errors import InputError, NotFound
+from amers.app.usecases import scenes
+from amers.app.usecases.features.stac import scene_media_type
+from amers.app.usecases.installation import Installation
+from amers.app.usecases.scenes import SentFile
 
 router = APIRouter(tags=["scenes"], route_class=CallerRoute)
 

@@ -7,11 +7,11 @@ from contextlib import contextmanager
 
 from fastapi import Request
 
-from app.api.body import body_chunks
-from app.auth import require_still_valid
-from app.db.engine import Database
-from app.db.tokens import Token
-from app.outages import outage_of
+from amers.app.api.body import body_chunks
+from amers.app.auth import require_still_valid
+from amers.app.db.engine import Database
+from amers.app.db.tokens import Token
+from amers.app.outages import outage_of
 
 CHECK_S = 5.0
 """Time after which a token is looked up again: an upload may take hours."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from uuid import UUID, uuid4
 
-from app.errors import NotAllowed
+from amers.app.errors import NotAllowed
 
 COOKIE = "amers_session"
 LIFETIME_S = 3600

@@ -8,16 +8,23 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
-from app.api.credentials import refuse_other_sites
-from app.api.deps import DatabaseDep, SecretDep
-from app.api.negotiation import refuse_unknown
-from app.api.pages import Page, document_page
-from app.api.routes import CallerRoute
-from app.api.session_cookie import COOKIE, LIFETIME_S, Session, format_session, parse_session, removal
-from app.auth import authenticate
-from app.db.engine import Database
-from app.db.tokens import Token, end_session
-from app.errors import NotAllowed
+from amers.app.api.credentials import refuse_other_sites
+from amers.app.api.deps import DatabaseDep, SecretDep
+from amers.app.api.negotiation import refuse_unknown
+from amers.app.api.pages import Page, document_page
+from amers.app.api.routes import CallerRoute
+from amers.app.api.session_cookie import (
+    COOKIE,
+    LIFETIME_S,
+    Session,
+    format_session,
+    parse_session,
+    removal,
+)
+from amers.app.auth import authenticate
+from amers.app.db.engine import Database
+from amers.app.db.tokens import Token, end_session
+from amers.app.errors import NotAllowed
 
 router = APIRouter(include_in_schema=False, route_class=CallerRoute)
 

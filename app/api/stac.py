@@ -19,10 +19,10 @@ from pydantic import (
     field_validator,
 )
 
-from app.api import features
-from app.api.access import needs
-from app.api.deps import CallerDep, DatabaseDep, SecretDep, SettingsDep
-from app.api.features import (
+from amers.app.api import features
+from amers.app.api.access import needs
+from amers.app.api.deps import CallerDep, DatabaseDep, SecretDep, SettingsDep
+from amers.app.api.features import (
     CrsUri,
     Format,
     ItemsQuery,
@@ -30,9 +30,9 @@ from app.api.features import (
     parameter_names,
     viewer_of,
 )
-from app.api.models.base import Link
-from app.api.models.features import StacItem, StacItems
-from app.api.negotiation import (
+from amers.app.api.models.base import Link
+from amers.app.api.models.features import StacItem, StacItems
+from amers.app.api.negotiation import (
     CRS_HEADER,
     FEATURES,
     GEOJSON,
@@ -44,17 +44,24 @@ from app.api.negotiation import (
     described,
     refuse_unknown,
 )
-from app.api.processes import inlined
-from app.api.routes import CallerRoute
-from app.auth import Scope
-from app.db.engine import Database
-from app.db.features.collection import Viewer
-from app.db.features.instants import parse_interval
-from app.db.features.outlines import SCENES
-from app.errors import InvalidParameter
-from app.usecases.features import items as all_features
-from app.usecases.features import stac
-from app.usecases.features.query import Bbox, FeatureQuery, ResolvedQuery, Restriction, crs_of, resolve
+from amers.app.api.processes import inlined
+from amers.app.api.routes import CallerRoute
+from amers.app.auth import Scope
+from amers.app.db.engine import Database
+from amers.app.db.features.collection import Viewer
+from amers.app.db.features.instants import parse_interval
+from amers.app.db.features.outlines import SCENES
+from amers.app.errors import InvalidParameter
+from amers.app.usecases.features import items as all_features
+from amers.app.usecases.features import stac
+from amers.app.usecases.features.query import (
+    Bbox,
+    FeatureQuery,
+    ResolvedQuery,
+    Restriction,
+    crs_of,
+    resolve,
+)
 
 router = APIRouter(tags=["stac"], route_class=CallerRoute)
 

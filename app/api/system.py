@@ -5,12 +5,12 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse
 
-from app.api import processes, stac
-from app.api.access import Public
-from app.api.features import Format
-from app.api.models.base import Link
-from app.api.models.documents import Conformance, Health, Landing, PartReadiness, ReadinessReport
-from app.api.negotiation import (
+from amers.app.api import processes, stac
+from amers.app.api.access import Public
+from amers.app.api.features import Format
+from amers.app.api.models.base import Link
+from amers.app.api.models.documents import Conformance, Health, Landing, PartReadiness, ReadinessReport
+from amers.app.api.negotiation import (
     DOCUMENTS,
     HTML,
     JSON,
@@ -21,11 +21,11 @@ from app.api.negotiation import (
     json_reply,
     refuse_unknown,
 )
-from app.api.operations_page import operations_page
-from app.api.pages import Cell, Page, document_page
-from app.api.public_address import address_state, log_wrong_address
-from app.api.routes import CallerRoute
-from app.usecases.readiness import Readiness, overall
+from amers.app.api.operations_page import operations_page
+from amers.app.api.pages import Cell, Page, document_page
+from amers.app.api.public_address import address_state, log_wrong_address
+from amers.app.api.routes import CallerRoute
+from amers.app.usecases.readiness import Readiness, overall
 
 router = APIRouter(tags=["system"], route_class=CallerRoute)
 

@@ -4,12 +4,12 @@ import hashlib
 
 from fastapi import APIRouter, Request, Response
 
-from app.api.access import Public
-from app.api.conditions import if_held
-from app.api.deps import DatabaseDep
-from app.api.features import CollectionDep, ViewerDep
-from app.api.models.base import Link
-from app.api.models.documents import (
+from amers.app.api.access import Public
+from amers.app.api.conditions import if_held
+from amers.app.api.deps import DatabaseDep
+from amers.app.api.features import CollectionDep, ViewerDep
+from amers.app.api.models.base import Link
+from amers.app.api.models.documents import (
     TileLayer,
     TileMatrix,
     TileMatrixSet,
@@ -18,13 +18,13 @@ from app.api.models.documents import (
     TileSet,
     TileSets,
 )
-from app.api.negotiation import JSON, MVT, TAG_HEADER
-from app.api.paths import PathNumber
-from app.api.routes import CallerRoute
-from app.db.features.collection import Collection
-from app.errors import NotFound
-from app.usecases.features import tiles
-from app.usecases.features.tiles import MATRIX_SET
+from amers.app.api.negotiation import JSON, MVT, TAG_HEADER
+from amers.app.api.paths import PathNumber
+from amers.app.api.routes import CallerRoute
+from amers.app.db.features.collection import Collection
+from amers.app.errors import NotFound
+from amers.app.usecases.features import tiles
+from amers.app.usecases.features.tiles import MATRIX_SET
 
 router = APIRouter(tags=["tiles"], route_class=CallerRoute)
 

@@ -3,17 +3,17 @@
 from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from app.api.deps import Admin, DatabaseDep, SettingsDep, TokenHolder
-from app.api.models.administration import (
+from amers.app.api.deps import Admin, DatabaseDep, SettingsDep, TokenHolder
+from amers.app.api.models.administration import (
     NewTokenRecord,
     OwnersUsage,
     OwnerUsage,
     TokenRecord,
     TokenRecords,
 )
-from app.api.routes import CallerRoute
-from app.auth import Scope
-from app.usecases import tokens, usage
+from amers.app.api.routes import CallerRoute
+from amers.app.auth import Scope
+from amers.app.usecases import tokens, usage
 
 router = APIRouter(prefix="/tokens", tags=["tokens"], route_class=CallerRoute)
 

@@ -7,8 +7,8 @@ Source: tus resumable upload protocol 1.0.0, core protocol, headers `Tus-Resumab
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.api.error_responses import problem
-from app.api.public_address import own_path
+from amers.app.api.error_responses import problem
+from amers.app.api.public_address import own_path
 
 VERSION = "1.0.0"
 UPLOADS = "/uploads"

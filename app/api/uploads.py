@@ -11,8 +11,8 @@ from fastapi import APIRouter, Depends, Header, Request, Response
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from app.api.access import FURTHER_SCOPES, Public
-from app.api.deps import (
+from amers.app.api.access import FURTHER_SCOPES, Public
+from amers.app.api.deps import (
     DatabaseDep,
     InstallationDep,
     Registrar,
@@ -20,15 +20,15 @@ from app.api.deps import (
     StorageDep,
     UploadTurn,
 )
-from app.api.error_responses import problem
-from app.api.models.scenes import Upload
-from app.api.routes import CallerRoute
-from app.api.sent_body import sent_chunks
-from app.api.tus import VERSION
-from app.db.uploads import UploadRow
-from app.errors import InputError
-from app.usecases import uploads
-from app.usecases.uploads import Busy, Checksum, NewUpload, Piece, WrongChecksum
+from amers.app.api.error_responses import problem
+from amers.app.api.models.scenes import Upload
+from amers.app.api.routes import CallerRoute
+from amers.app.api.sent_body import sent_chunks
+from amers.app.api.tus import VERSION
+from amers.app.db.uploads import UploadRow
+from amers.app.errors import InputError
+from amers.app.usecases import uploads
+from amers.app.usecases.uploads import Busy, Checksum, NewUpload, Piece, WrongChecksum
 
 PIECE = "application/offset+octet-stream"
 ALGORITHMS = ("sha1", "sha256")

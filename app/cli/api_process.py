@@ -7,9 +7,9 @@ from importlib import import_module
 
 import uvicorn
 
-from app import logs
-from app.api import connections
-from app.config import Settings, read_settings
+from amers.app import logs
+from amers.app.api import connections
+from amers.app.config import Settings, read_settings
 
 DRAIN_SECONDS = 30
 """Time that requests under way have to finish when the service stops."""
@@ -38,7 +38,7 @@ def run(descriptors: list[int]) -> None:
     log_public_address(settings)
     # What is imported stays: a search for garbage in it finds none.
     gc.disable()
-    application = import_module("app.main").create_app
+    application = import_module("amers.app.main").create_app
     gc.freeze()
     gc.enable()
     config = uvicorn.Config(

@@ -7,7 +7,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand
 
-from app.errors import AmersError
+from amers.app.errors import AmersError
 
 INPUT = re.compile(r"^[a-z_]+(?=: )|(?<=`)[a-z_]+(?=`)")
 """The name of an input in an error of the science or of a use case, which know no options."""

@@ -5,10 +5,10 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli.output import AsJson, as_text, show
-from app.cli.transaction import transaction
-from app.db.audit import Change
-from app.usecases import operations
+from amers.app.cli.output import AsJson, as_text, show
+from amers.app.cli.transaction import transaction
+from amers.app.db.audit import Change
+from amers.app.usecases import operations
 
 LONGEST_VALUE = 60
 """Characters of a value in the table; --json has all."""

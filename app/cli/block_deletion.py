@@ -4,14 +4,14 @@ from typing import Annotated
 
 import typer
 
-from app.cli.block_listing import block_row
-from app.cli.deletion import giving_up_reserve
-from app.cli.output import AsJson, show_one
-from app.config import read_settings
-from app.db import engine
-from app.storage import open_storage
-from app.usecases.blocks.deletion import delete_block
-from app.usecases.installation import Installation
+from amers.app.cli.block_listing import block_row
+from amers.app.cli.deletion import giving_up_reserve
+from amers.app.cli.output import AsJson, show_one
+from amers.app.config import read_settings
+from amers.app.db import engine
+from amers.app.storage import open_storage
+from amers.app.usecases.blocks.deletion import delete_block
+from amers.app.usecases.installation import Installation
 
 
 @giving_up_reserve

@@ -1,13 +1,13 @@
 """`amers block show`: one block of the store."""
 
-from app.cli.block_listing import Reference, block_row
-from app.cli.block_renewal import renewal_row
-from app.cli.output import AsJson, print_json, show_one
-from app.cli.transaction import transaction
-from app.usecases.blocks import lifecycle
-from app.usecases.blocks.lookup import block_extent
-from app.usecases.blocks.renewal import find_renewal
-from services.quality.accuracy_statement import accuracy_document
+from amers.app.cli.block_listing import Reference, block_row
+from amers.app.cli.block_renewal import renewal_row
+from amers.app.cli.output import AsJson, print_json, show_one
+from amers.app.cli.transaction import transaction
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.blocks.lookup import block_extent
+from amers.app.usecases.blocks.renewal import find_renewal
+from amers.services.quality.accuracy_statement import accuracy_document
 
 
 def show_block(reference: Reference, as_json: AsJson = False) -> None:

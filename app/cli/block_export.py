@@ -5,15 +5,15 @@ from typing import Annotated
 
 import typer
 
-from app.cli.box_option import BoxText, box_of
-from app.cli.output import AsJson, show_one
-from app.cli.progress import shown_progress
-from app.config import read_settings
-from app.db.engine import opened
-from app.errors import InputError
-from app.usecases import storage_identity
-from app.usecases.blocks.export import ExportBlock, select_points, write_selected
-from app.usecases.damage import open_chips
+from amers.app.cli.box_option import BoxText, box_of
+from amers.app.cli.output import AsJson, show_one
+from amers.app.cli.progress import shown_progress
+from amers.app.config import read_settings
+from amers.app.db.engine import opened
+from amers.app.errors import InputError
+from amers.app.usecases import storage_identity
+from amers.app.usecases.blocks.export import ExportBlock, select_points, write_selected
+from amers.app.usecases.damage import open_chips
 
 
 def export(

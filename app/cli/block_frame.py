@@ -5,13 +5,13 @@ from typing import Annotated
 
 import typer
 
-from app.cli import control_options
-from app.cli.output import AsJson, Row, show_one
-from app.cli.production_rows import accuracy_row
-from app.cli.progress import shown_progress
-from app.errors import InputError
-from app.usecases.blocks.frame import PlacedBlock, place_block
-from app.usecases.control_files import ControlFiles
+from amers.app.cli import control_options
+from amers.app.cli.output import AsJson, Row, show_one
+from amers.app.cli.production_rows import accuracy_row
+from amers.app.cli.progress import shown_progress
+from amers.app.errors import InputError
+from amers.app.usecases.blocks.frame import PlacedBlock, place_block
+from amers.app.usecases.control_files import ControlFiles
 
 
 def frame(

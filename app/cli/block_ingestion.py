@@ -6,17 +6,17 @@ from typing import Annotated
 
 import typer
 
-from app.cli.block_listing import block_row
-from app.cli.block_quality import quality_row
-from app.cli.output import AsJson, print_json, show_one
-from app.cli.progress import shown_progress
-from app.cli.transaction import transaction
-from app.config import read_settings
-from app.storage import open_storage
-from app.usecases import storage_identity
-from app.usecases.blocks import lifecycle
-from services.quality.accuracy_statement import accuracy_document
-from services.quality.block import quality_document
+from amers.app.cli.block_listing import block_row
+from amers.app.cli.block_quality import quality_row
+from amers.app.cli.output import AsJson, print_json, show_one
+from amers.app.cli.progress import shown_progress
+from amers.app.cli.transaction import transaction
+from amers.app.config import read_settings
+from amers.app.storage import open_storage
+from amers.app.usecases import storage_identity
+from amers.app.usecases.blocks import lifecycle
+from amers.services.quality.accuracy_statement import accuracy_document
+from amers.services.quality.block import quality_document
 
 
 def ingest(

@@ -4,11 +4,11 @@ from typing import Annotated
 
 import typer
 
-from app.cli.output import AsJson, Row, show
-from app.cli.reading import reading
-from app.db.block_list import BlockSummary
-from app.usecases.blocks import listing
-from services.quality.accuracy_statement import accuracy_document
+from amers.app.cli.output import AsJson, Row, show
+from amers.app.cli.reading import reading
+from amers.app.db.block_list import BlockSummary
+from amers.app.usecases.blocks import listing
+from amers.services.quality.accuracy_statement import accuracy_document
 
 Reference = Annotated[str, typer.Argument(help="Number of the block, its ID, or ID@VERSION.")]
 

@@ -6,16 +6,16 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from app.cli.exit_status import NO_RESULT
-from app.cli.output import AsJson, Row, print_json, show_one
-from app.cli.progress import shown_progress
-from app.cli.transaction import transaction
-from app.config import read_settings
-from app.db.engine import opened
-from app.errors import InputError
-from app.usecases import storage_identity
-from app.usecases.blocks import lifecycle
-from app.usecases.blocks.quality import (
+from amers.app.cli.exit_status import NO_RESULT
+from amers.app.cli.output import AsJson, Row, print_json, show_one
+from amers.app.cli.progress import shown_progress
+from amers.app.cli.transaction import transaction
+from amers.app.config import read_settings
+from amers.app.db.engine import opened
+from amers.app.errors import InputError
+from amers.app.usecases import storage_identity
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.blocks.quality import (
     HeightFiles,
     QualityReferences,
     RequiredQuality,
@@ -23,14 +23,14 @@ from app.usecases.blocks.quality import (
     assess_folder,
     write_quality,
 )
-from app.usecases.blocks.stored_quality import assess_stored
-from app.usecases.terrain_file import TerrainFile
-from services.formats.block.document_json import BLOCK_JSON
-from services.quality.accuracy_statement import accuracy_document
-from services.quality.block import BlockQuality, Distribution, quality_document
-from services.reports.block_quality import BlockQualityReport
-from services.reports.block_quality_pages import quality_tables
-from services.reports.document import report_document
+from amers.app.usecases.blocks.stored_quality import assess_stored
+from amers.app.usecases.terrain_file import TerrainFile
+from amers.services.formats.block.document_json import BLOCK_JSON
+from amers.services.quality.accuracy_statement import accuracy_document
+from amers.services.quality.block import BlockQuality, Distribution, quality_document
+from amers.services.reports.block_quality import BlockQualityReport
+from amers.services.reports.block_quality_pages import quality_tables
+from amers.services.reports.document import report_document
 
 _TABLE_WIDTH = 110
 _Files = list[Path] | None

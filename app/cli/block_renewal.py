@@ -8,17 +8,17 @@ from uuid import UUID
 
 import typer
 
-from app.cli.output import AsJson, Row, print_json, show_one
-from app.cli.progress import shown_progress
-from app.cli.transaction import transaction
-from app.config import read_settings
-from app.db.engine import opened
-from app.errors import InputError
-from app.storage import open_storage
-from app.usecases import storage_identity
-from app.usecases.blocks.renewal import read_base, renew_block, stage_renewal
-from app.usecases.blocks.renewing_scenes import registered_job, scene_of_image, scene_of_job
-from services.types import part_of
+from amers.app.cli.output import AsJson, Row, print_json, show_one
+from amers.app.cli.progress import shown_progress
+from amers.app.cli.transaction import transaction
+from amers.app.config import read_settings
+from amers.app.db.engine import opened
+from amers.app.errors import InputError
+from amers.app.storage import open_storage
+from amers.app.usecases import storage_identity
+from amers.app.usecases.blocks.renewal import read_base, renew_block, stage_renewal
+from amers.app.usecases.blocks.renewing_scenes import registered_job, scene_of_image, scene_of_job
+from amers.services.types import part_of
 
 
 def renew(

@@ -4,11 +4,11 @@ from typing import Annotated
 
 import typer
 
-from app.cli.block_listing import Reference, block_row
-from app.cli.output import AsJson, Row, show_one
-from app.cli.transaction import transaction
-from app.usecases.blocks import publication
-from app.usecases.blocks.publication import Published
+from amers.app.cli.block_listing import Reference, block_row
+from amers.app.cli.output import AsJson, Row, show_one
+from amers.app.cli.transaction import transaction
+from amers.app.usecases.blocks import publication
+from amers.app.usecases.blocks.publication import Published
 
 
 def publish(reference: Reference, as_json: AsJson = False) -> None:

@@ -4,9 +4,9 @@ from typing import Annotated
 
 import typer
 
-from app.db.features.bbox import Box
-from app.errors import InputError, InvalidParameter
-from app.usecases.features.query import parse_bbox
+from amers.app.db.features.bbox import Box
+from amers.app.errors import InputError, InvalidParameter
+from amers.app.usecases.features.query import parse_bbox
 
 EXPECTED = "give W,S,E,N in degrees, such as 5.39,43.59,5.41,43.61"
 HALF_THE_EARTH = 180.0

@@ -1,6 +1,6 @@
 """All commands of `amers`: noun, then verb, and the function behind each."""
 
-from app.cli.on_demand import Command, Group, Tree
+from amers.app.cli.on_demand import Command, Group, Tree
 
 COMMANDS: Tree = {
     "block": Group(

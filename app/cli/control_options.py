@@ -6,13 +6,13 @@ from typing import Annotated, TypedDict, Unpack
 
 import typer
 
-from app.cli.point_statements import sigma_pair, stated_by_caller
-from app.errors import InputError
-from app.usecases.control_files import ControlFiles, HeightFile
-from app.usecases.marked_files import PointStatements
-from app.usecases.terrain_file import TerrainFile
-from services.formats.gcp.text_formats import ECEF, LAT_LON_HEIGHT
-from services.quality.check_points import MARKING_SIGMA_PX
+from amers.app.cli.point_statements import sigma_pair, stated_by_caller
+from amers.app.errors import InputError
+from amers.app.usecases.control_files import ControlFiles, HeightFile
+from amers.app.usecases.marked_files import PointStatements
+from amers.app.usecases.terrain_file import TerrainFile
+from amers.services.formats.gcp.text_formats import ECEF, LAT_LON_HEIGHT
+from amers.services.quality.check_points import MARKING_SIGMA_PX
 
 Control = Annotated[
     list[Path] | None,

@@ -1,9 +1,9 @@
 """`amers db upgrade` and `status`: the schema of the database."""
 
-from app.cli.output import AsJson, show_one
-from app.config import read_settings
-from app.db import revisions
-from app.db.cluster import embedded
+from amers.app.cli.output import AsJson, show_one
+from amers.app.config import read_settings
+from amers.app.db import revisions
+from amers.app.db.cluster import embedded
 
 
 def upgrade(as_json: AsJson = False) -> None:

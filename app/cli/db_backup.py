@@ -5,17 +5,17 @@ from typing import Annotated
 
 import typer
 
-from app.cli.output import AsJson, show_one
-from app.cli.progress import shown_progress
-from app.config import read_settings
-from app.db import engine, revisions
-from app.db.cluster import backup as archive
-from app.db.cluster import embedded
-from app.storage import open_storage
-from app.usecases.backups.make import make_backup
-from app.usecases.backups.manifest import Manifest, find_problems, read_manifest
-from app.usecases.backups.restore import restore_backup
-from app.usecases.installation import Installation
+from amers.app.cli.output import AsJson, show_one
+from amers.app.cli.progress import shown_progress
+from amers.app.config import read_settings
+from amers.app.db import engine, revisions
+from amers.app.db.cluster import backup as archive
+from amers.app.db.cluster import embedded
+from amers.app.storage import open_storage
+from amers.app.usecases.backups.make import make_backup
+from amers.app.usecases.backups.manifest import Manifest, find_problems, read_manifest
+from amers.app.usecases.backups.restore import restore_backup
+from amers.app.usecases.installation import Installation
 
 EXIT_DAMAGED = 1
 EXIT_REFUSED = 2

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from functools import partial, wraps
 from typing import ParamSpec
 
-from app import reserve
-from app.config import read_settings
+from amers.app import reserve
+from amers.app.config import read_settings
 
 Parameters = ParamSpec("Parameters")
 

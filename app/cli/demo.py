@@ -9,14 +9,14 @@ from typing import Annotated
 
 import typer
 
-from app.cli.output import AsJson, Row, show, show_one
-from app.cli.progress import shown_progress
-from app.config import Settings
-from app.errors import InputError
-from app.usecases.demo import DemoOptions, DemoOutcome, run_demo
-from services.quality.accuracy_statement import accuracy_document
-from services.quality.criteria import verdict_scope
-from services.types import Array
+from amers.app.cli.output import AsJson, Row, show, show_one
+from amers.app.cli.progress import shown_progress
+from amers.app.config import Settings
+from amers.app.errors import InputError
+from amers.app.usecases.demo import DemoOptions, DemoOutcome, run_demo
+from amers.services.quality.accuracy_statement import accuracy_document
+from amers.services.quality.criteria import verdict_scope
+from amers.services.types import Array
 
 MARK = ".amers-demo"
 

@@ -10,7 +10,7 @@
 | 130 | interrupted |
 """
 
-from app.errors import AmersError, ComputationError, PortInUse
+from amers.app.errors import AmersError, ComputationError, PortInUse
 
 SUCCESS = 0
 FAILURE = 1

@@ -4,10 +4,10 @@ import traceback
 
 import typer
 
-from app.cli.exit_status import FAILURE, REFUSED, exit_status
-from app.errors import AmersError, StorageOutage, is_no_memory, is_no_room
-from app.outages import outage_of
-from app.printable import printable
+from amers.app.cli.exit_status import FAILURE, REFUSED, exit_status
+from amers.app.errors import AmersError, StorageOutage, is_no_memory, is_no_room
+from amers.app.outages import outage_of
+from amers.app.printable import printable
 
 
 def failure(error: Exception) -> tuple[str, int]:
@@ -30,7 +30,7 @@ def _sentence(error: Exception) -> str:
         return f"{error}; see that the storage is mounted and can be used, then run the command again"
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}; expected a place that this user can use"
-    if _comes_from(error, "app.client.errors"):
+    if _comes_from(error, "amers.app.client.errors"):
         return f"{error}; see that the service answers at this address, then run the command again"
     if (outage := outage_of(error)) is not None:
         return f"{outage.reason}; run the command again" if outage.again else outage.reason

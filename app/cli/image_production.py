@@ -9,20 +9,20 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from app.cli import control_options
-from app.cli.output import AsJson, show_one
-from app.cli.production_rows import accuracy_row, control_row, effort_row, sampling_pair
-from app.cli.progress import shown_progress
-from app.errors import InputError
-from app.usecases.executors import ComputeOptions
-from app.usecases.ground_classes import GroundFiles
-from app.usecases.image_production import ProductionImages, WorkPlace, run_production
-from app.usecases.image_selection import CatalogueRequest, run_selection
-from app.usecases.production import BlockIdentity, refuse_existing
-from services.formats.addresses import file_place
-from services.production.from_images import ProductionOptions
-from services.reports.block_adjustment_pages import adjustment_table
-from services.types import part_of
+from amers.app.cli import control_options
+from amers.app.cli.output import AsJson, show_one
+from amers.app.cli.production_rows import accuracy_row, control_row, effort_row, sampling_pair
+from amers.app.cli.progress import shown_progress
+from amers.app.errors import InputError
+from amers.app.usecases.executors import ComputeOptions
+from amers.app.usecases.ground_classes import GroundFiles
+from amers.app.usecases.image_production import ProductionImages, WorkPlace, run_production
+from amers.app.usecases.image_selection import CatalogueRequest, run_selection
+from amers.app.usecases.production import BlockIdentity, refuse_existing
+from amers.services.formats.addresses import file_place
+from amers.services.production.from_images import ProductionOptions
+from amers.services.reports.block_adjustment_pages import adjustment_table
+from amers.services.types import part_of
 
 _DEFAULT = ProductionOptions()
 _SHARE_OF_SELECTION = 0.05

@@ -8,13 +8,13 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from app.cli.output import AsJson, print_json
-from app.cli.progress import shown_progress
-from app.errors import InputError
-from app.usecases.image_selection import CatalogueRequest, run_selection
-from services.production.image_selection import SelectionOptions
-from services.reports.selection import selection_document
-from services.reports.selection_pages import selection_tables
+from amers.app.cli.output import AsJson, print_json
+from amers.app.cli.progress import shown_progress
+from amers.app.errors import InputError
+from amers.app.usecases.image_selection import CatalogueRequest, run_selection
+from amers.services.production.image_selection import SelectionOptions
+from amers.services.reports.selection import selection_document
+from amers.services.reports.selection_pages import selection_tables
 
 _DEFAULT = SelectionOptions()
 _DEFAULT_LIMITS = ",".join(f"{limit:g}" for limit in _DEFAULT.cloud_limits_percent)

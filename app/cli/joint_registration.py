@@ -10,27 +10,27 @@ from typing import Any
 
 import typer
 
-from app.cli.progress import shown_progress
-from app.cli.scene_registration import Outcome, SceneRequest, failed_outcome, registered_outcome
-from app.config import read_settings
-from app.db import engine
-from app.db.engine import Database
-from app.errors import AmersError, ComputationError, InputError
-from app.usecases import storage_identity
-from app.usecases.executors import ComputeOptions
-from app.usecases.registration.control_sources import FindPoints, points_of_block, points_of_store
-from app.usecases.registration.joined_scenes import read_joined
-from app.usecases.registration.register import SceneFiles, image_key, record_registration
-from app.usecases.registration.result_folder import older_result, replacing
-from app.usecases.registration.together import (
+from amers.app.cli.progress import shown_progress
+from amers.app.cli.scene_registration import Outcome, SceneRequest, failed_outcome, registered_outcome
+from amers.app.config import read_settings
+from amers.app.db import engine
+from amers.app.db.engine import Database
+from amers.app.errors import AmersError, ComputationError, InputError
+from amers.app.usecases import storage_identity
+from amers.app.usecases.executors import ComputeOptions
+from amers.app.usecases.registration.control_sources import FindPoints, points_of_block, points_of_store
+from amers.app.usecases.registration.joined_scenes import read_joined
+from amers.app.usecases.registration.register import SceneFiles, image_key, record_registration
+from amers.app.usecases.registration.result_folder import older_result, replacing
+from amers.app.usecases.registration.together import (
     BLOCK_FOLDER,
     JointOutcome,
     JointPlace,
     run_joint_registration,
 )
-from services.quality.qualification import QualificationOptions
-from services.registration.options import RegistrationOptions
-from services.reports.document import report_document
+from amers.services.quality.qualification import QualificationOptions
+from amers.services.registration.options import RegistrationOptions
+from amers.services.reports.document import report_document
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ from typing import Annotated, Any
 
 import typer
 
-from app.child_processes import leave_out_working_folder
-from app.cli.commands import COMMANDS
-from app.cli.exit_status import FAILURE, INTERRUPTED, REFUSED
-from app.cli.failures import failure, print_traceback
-from app.cli.on_demand import GroupOnDemand
-from app.errors import AmersError
-from app.one_thread import use_one_thread
+from amers.app.child_processes import leave_out_working_folder
+from amers.app.cli.commands import COMMANDS
+from amers.app.cli.exit_status import FAILURE, INTERRUPTED, REFUSED
+from amers.app.cli.failures import failure, print_traceback
+from amers.app.cli.on_demand import GroupOnDemand
+from amers.app.errors import AmersError
+from amers.app.one_thread import use_one_thread
 
 OBJECTS_BEFORE_COLLECTION = 20_000
 """More than Python's 700: what is imported stays, and to look through it costs a tenth of the start."""
@@ -82,7 +82,7 @@ def _is_help(error: Exception) -> bool:
 
 def _debugs() -> bool:
     """Whether the settings ask for details."""
-    from app.config import read_settings  # most errors need no settings
+    from amers.app.config import read_settings  # most errors need no settings
 
     try:
         return read_settings().log_level == "debug"

@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
-from app.cli.arguments import CheckedCommand
+from amers.app.cli.arguments import CheckedCommand
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Command:
     """One command.
 
     Attributes:
-        function: `MODULE:FUNCTION` below `app.cli`.
+        function: `MODULE:FUNCTION` below `amers.app.cli`.
         help: the first line of the function's docstring, for lists of commands.
     """
 
@@ -84,5 +84,5 @@ def _load(name: str, entry: Command | Group) -> Any:
         return GroupOnDemand(entry.commands, name=name, help=entry.help, no_args_is_help=True)
     module, _, function = entry.function.partition(":")
     one = typer.Typer(add_completion=False)
-    one.command(name, cls=CheckedCommand)(getattr(import_module(f"app.cli.{module}"), function))
+    one.command(name, cls=CheckedCommand)(getattr(import_module(f"amers.app.cli.{module}"), function))
     return get_command(one)

@@ -12,7 +12,7 @@ from uuid import UUID
 
 import typer
 
-from app.printable import printable
+from amers.app.printable import printable
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 

@@ -6,11 +6,11 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from app.cli.output import AsJson, print_json
-from app.cli.progress import shown_progress
-from app.usecases.planning import run_plan
-from services.reports.plan import plan_document
-from services.reports.plan_pages import plan_tables
+from amers.app.cli.output import AsJson, print_json
+from amers.app.cli.progress import shown_progress
+from amers.app.usecases.planning import run_plan
+from amers.services.reports.plan import plan_document
+from amers.services.reports.plan_pages import plan_tables
 
 _TABLE_WIDTH = 100
 

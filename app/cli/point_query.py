@@ -12,14 +12,14 @@ from typing import Annotated, BinaryIO
 
 import typer
 
-from app.cli.box_option import BoxText, box_of
-from app.cli.output import AsJson, print_json
-from app.cli.transaction import transaction
-from app.client import Client, Feature
-from app.db.features.bbox import Box
-from app.db.features.counts import Count
-from app.errors import InputError
-from app.usecases.features import points
+from amers.app.cli.box_option import BoxText, box_of
+from amers.app.cli.output import AsJson, print_json
+from amers.app.cli.transaction import transaction
+from amers.app.client import Client, Feature
+from amers.app.db.features.bbox import Box
+from amers.app.db.features.counts import Count
+from amers.app.errors import InputError
+from amers.app.usecases.features import points
 
 
 class PointFormat(StrEnum):

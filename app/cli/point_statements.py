@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from app.errors import InputError
-from services.formats.gcp.csv_points import CsvLayout, parse_columns
-from services.formats.gcp.reader import StatedByCaller
-from services.formats.gcp.text_formats import ECEF, LAT_LON_HEIGHT
+from amers.app.errors import InputError
+from amers.services.formats.gcp.csv_points import CsvLayout, parse_columns
+from amers.services.formats.gcp.reader import StatedByCaller
+from amers.services.formats.gcp.text_formats import ECEF, LAT_LON_HEIGHT
 
 
 def stated_by_caller(

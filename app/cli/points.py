@@ -4,9 +4,9 @@ from typing import Annotated
 
 import typer
 
-from app.cli.output import AsJson, show, show_one
-from app.cli.transaction import transaction
-from app.usecases import history
+from amers.app.cli.output import AsJson, show, show_one
+from amers.app.cli.transaction import transaction
+from amers.app.usecases import history
 
 
 def suspensions(

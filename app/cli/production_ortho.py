@@ -5,13 +5,13 @@ from typing import Annotated
 
 import typer
 
-from app.cli.output import AsJson, show_one
-from app.cli.production_rows import accuracy_row, agreement_row, sampling_pair
-from app.cli.progress import shown_progress
-from app.usecases.production import BlockIdentity, OrthoFiles, run_ortho_production
-from app.usecases.terrain_file import TerrainFile
-from services.production.from_images import ProductionOptions
-from services.production.from_ortho import OrthoPointOptions
+from amers.app.cli.output import AsJson, show_one
+from amers.app.cli.production_rows import accuracy_row, agreement_row, sampling_pair
+from amers.app.cli.progress import shown_progress
+from amers.app.usecases.production import BlockIdentity, OrthoFiles, run_ortho_production
+from amers.app.usecases.terrain_file import TerrainFile
+from amers.services.production.from_images import ProductionOptions
+from amers.services.production.from_ortho import OrthoPointOptions
 
 _DEFAULT = ProductionOptions()
 _ORTHO_DEFAULT = OrthoPointOptions()

@@ -5,16 +5,16 @@ from typing import Annotated
 
 import typer
 
-from app.cli.output import AsJson, show_one
-from app.cli.point_statements import sigma_pair, stated_by_caller
-from app.cli.production_rows import accuracy_row, agreement_row, sampling_pair
-from app.cli.progress import shown_progress
-from app.usecases.points_production import KnownPointFiles, run_points_production
-from app.usecases.production import BlockIdentity
-from app.usecases.terrain_file import TerrainFile
-from services.formats.gcp.csv_points import PIXEL_ORIGINS
-from services.formats.gcp.text_formats import ECEF, LAT_LON_HEIGHT
-from services.production.from_points import KnownPointOptions
+from amers.app.cli.output import AsJson, show_one
+from amers.app.cli.point_statements import sigma_pair, stated_by_caller
+from amers.app.cli.production_rows import accuracy_row, agreement_row, sampling_pair
+from amers.app.cli.progress import shown_progress
+from amers.app.usecases.points_production import KnownPointFiles, run_points_production
+from amers.app.usecases.production import BlockIdentity
+from amers.app.usecases.terrain_file import TerrainFile
+from amers.services.formats.gcp.csv_points import PIXEL_ORIGINS
+from amers.services.formats.gcp.text_formats import ECEF, LAT_LON_HEIGHT
+from amers.services.production.from_points import KnownPointOptions
 
 _DEFAULT = KnownPointOptions()
 

@@ -6,14 +6,14 @@ from dataclasses import asdict
 
 import numpy as np
 
-from app.cli.output import Row
-from app.errors import InputError
-from services.adjustment.bundle import BlockAdjustment
-from services.adjustment.control_ground import ControlGround
-from services.quality.accuracy_statement import accuracy_document
-from services.quality.block import produced_accuracy
-from services.tasks import Effort
-from services.types import Array, ControlPoints
+from amers.app.cli.output import Row
+from amers.app.errors import InputError
+from amers.services.adjustment.bundle import BlockAdjustment
+from amers.services.adjustment.control_ground import ControlGround
+from amers.services.quality.accuracy_statement import accuracy_document
+from amers.services.quality.block import produced_accuracy
+from amers.services.tasks import Effort
+from amers.services.types import Array, ControlPoints
 
 
 def agreement_row(shift_m: Array, local_sigma_m: float) -> Row:

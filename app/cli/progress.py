@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 
-from app.printable import printable
-from services.types import Progress
+from amers.app.printable import printable
+from amers.services.types import Progress
 
 
 @contextmanager

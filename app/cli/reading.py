@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from app.config import read_settings
-from app.db.ready import ready_database
-from app.db.revisions import driver_connection
-from app.db.session import DriverConnection
+from amers.app.config import read_settings
+from amers.app.db.ready import ready_database
+from amers.app.db.revisions import driver_connection
+from amers.app.db.session import DriverConnection
 
 
 @contextmanager

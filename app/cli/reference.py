@@ -4,13 +4,13 @@ from typing import Annotated
 
 import typer
 
-from app.cli.deletion import giving_up_reserve
-from app.cli.output import AsJson, Row, show, show_one
-from app.cli.transaction import transaction
-from app.config import read_settings
-from app.db.references import ReferenceRow
-from app.usecases import references
-from app.usecases.references import NewReference
+from amers.app.cli.deletion import giving_up_reserve
+from amers.app.cli.output import AsJson, Row, show, show_one
+from amers.app.cli.transaction import transaction
+from amers.app.config import read_settings
+from amers.app.db.references import ReferenceRow
+from amers.app.usecases import references
+from amers.app.usecases.references import NewReference
 
 
 def add(

@@ -4,12 +4,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-from app.client import Client, Job, JobFailed, ServiceFailure
-from app.errors import AmersError, ComputationError, InputError
-from app.usecases.registration.register import SceneFiles
-from services import errors
-from services.formats.images.scenes import model_files
-from services.types import Progress, part_of
+from amers.app.client import Client, Job, JobFailed, ServiceFailure
+from amers.app.errors import AmersError, ComputationError, InputError
+from amers.app.usecases.registration.register import SceneFiles
+from amers.services import errors
+from amers.services.formats.images.scenes import model_files
+from amers.services.types import Progress, part_of
 
 UPLOAD_SHARE = 0.2
 """Share of the upload in the progress."""

@@ -6,10 +6,10 @@ from typing import Annotated
 
 import typer
 
-from app.cli.arguments import by_options
-from app.cli.exit_status import SUCCESS
-from app.cli.output import AsJson
-from app.cli.scene_registration import (
+from amers.app.cli.arguments import by_options
+from amers.app.cli.exit_status import SUCCESS
+from amers.app.cli.output import AsJson
+from amers.app.cli.scene_registration import (
     Control,
     Remote,
     SceneRequest,
@@ -18,11 +18,11 @@ from app.cli.scene_registration import (
     register_scenes,
     worst_status,
 )
-from app.cli.scene_rows import refuse_shared_files, show_outcome, show_outcomes, write_overview
-from app.errors import InputError
-from app.usecases.registration.reference_source import ReferenceFiles, check_map
-from app.usecases.registration.register import SceneFiles
-from app.usecases.terrain_file import TerrainFile
+from amers.app.cli.scene_rows import refuse_shared_files, show_outcome, show_outcomes, write_overview
+from amers.app.errors import InputError
+from amers.app.usecases.registration.reference_source import ReferenceFiles, check_map
+from amers.app.usecases.registration.register import SceneFiles
+from amers.app.usecases.terrain_file import TerrainFile
 
 
 def register(

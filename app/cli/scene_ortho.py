@@ -6,12 +6,12 @@ from typing import Annotated
 
 import typer
 
-from app.cli.output import AsJson, show_one
-from app.cli.progress import shown_progress
-from app.errors import InputError
-from app.usecases.orthorectification import OrthoMap, run_orthorectification
-from app.usecases.terrain_file import TerrainFile
-from services.orthorectification.rectify import OrthoOptions
+from amers.app.cli.output import AsJson, show_one
+from amers.app.cli.progress import shown_progress
+from amers.app.errors import InputError
+from amers.app.usecases.orthorectification import OrthoMap, run_orthorectification
+from amers.app.usecases.terrain_file import TerrainFile
+from amers.services.orthorectification.rectify import OrthoOptions
 
 
 def ortho(

@@ -14,20 +14,20 @@ from typing import Any
 
 import typer
 
-from app.cli.exit_status import FAILURE, NO_RESULT, SUCCESS, exit_status
-from app.cli.progress import shown_progress
-from app.cli.remote import register
-from app.client import Client, RequestRefused, ServiceFailure
-from app.config import Settings, read_settings
-from app.db import engine
-from app.db.engine import Database
-from app.errors import AmersError, ComputationError, InputError
-from app.usecases import storage_identity
-from app.usecases.references import references_of_store
-from app.usecases.registration.control_sources import points_of_block, points_of_store
-from app.usecases.registration.failure import FAILURE_OUTPUTS, Attempt, write_failure
-from app.usecases.registration.reference_source import ReferenceFiles, given_reference
-from app.usecases.registration.register import (
+from amers.app.cli.exit_status import FAILURE, NO_RESULT, SUCCESS, exit_status
+from amers.app.cli.progress import shown_progress
+from amers.app.cli.remote import register
+from amers.app.client import Client, RequestRefused, ServiceFailure
+from amers.app.config import Settings, read_settings
+from amers.app.db import engine
+from amers.app.db.engine import Database
+from amers.app.errors import AmersError, ComputationError, InputError
+from amers.app.usecases import storage_identity
+from amers.app.usecases.references import references_of_store
+from amers.app.usecases.registration.control_sources import points_of_block, points_of_store
+from amers.app.usecases.registration.failure import FAILURE_OUTPUTS, Attempt, write_failure
+from amers.app.usecases.registration.reference_source import ReferenceFiles, given_reference
+from amers.app.usecases.registration.register import (
     ControlSources,
     RegisteredScene,
     SceneFiles,
@@ -35,15 +35,15 @@ from app.usecases.registration.register import (
     record_registration,
     run_registration,
 )
-from app.usecases.registration.result_folder import older_result, replacing
-from app.usecases.uploads import IMAGE_SUFFIXES
-from app.worker.warm_process import WarmProcess, WarmServer
-from services.quality.accuracy_statement import accuracy_document
-from services.quality.qualification import QualificationOptions
-from services.registration.options import RegistrationOptions
-from services.reports.document import report_document
-from services.reports.failure import NO_ACCURACY, NOT_REGISTERED
-from services.types import Progress, no_progress
+from amers.app.usecases.registration.result_folder import older_result, replacing
+from amers.app.usecases.uploads import IMAGE_SUFFIXES
+from amers.app.worker.warm_process import WarmProcess, WarmServer
+from amers.services.quality.accuracy_statement import accuracy_document
+from amers.services.quality.qualification import QualificationOptions
+from amers.services.registration.options import RegistrationOptions
+from amers.services.reports.document import report_document
+from amers.services.reports.failure import NO_ACCURACY, NOT_REGISTERED
+from amers.services.types import Progress, no_progress
 
 Register = Callable[["SceneRequest", Path, Progress], dict[str, Any]]
 """Registers the scene of a request into a folder and returns its report."""
@@ -51,7 +51,7 @@ Outcome = dict[str, Any]
 """What became of one scene: `scene`, `verdict`, `reason`, `exit_status`; figures where there are any;
 and the folder `output` when this run has put its result there."""
 
-_FUNCTION = "app.cli.scene_registration:register_in_process"
+_FUNCTION = "amers.app.cli.scene_registration:register_in_process"
 _POLL_S = 1.0
 
 

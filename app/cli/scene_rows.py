@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from app.cli.output import print_json, show, show_one
-from app.cli.scene_registration import Outcome
-from app.errors import InputError
-from services.quality.accuracy_statement import ON_THE_EARTH, RELATIVE
-from services.reports.overview import OverviewRow, format_overview
+from amers.app.cli.output import print_json, show, show_one
+from amers.app.cli.scene_registration import Outcome
+from amers.app.errors import InputError
+from amers.services.quality.accuracy_statement import ON_THE_EARTH, RELATIVE
+from amers.services.reports.overview import OverviewRow, format_overview
 
 OVERVIEW = "overview.html"
 """File of the page over the reports of several scenes."""

@@ -5,14 +5,14 @@ from typing import Annotated
 
 import typer
 
-from app.cli.arguments import by_options
-from app.cli.exit_status import SUCCESS
-from app.cli.joint_registration import JointRequest, register_together
-from app.cli.output import AsJson, print_json, show_one
-from app.cli.scene_registration import failure_text, images_of, worst_status
-from app.cli.scene_rows import refuse_shared_files, show_outcomes
-from app.usecases.registration.register import SceneFiles
-from services.sensors.parameter_sets import parameter_set_named
+from amers.app.cli.arguments import by_options
+from amers.app.cli.exit_status import SUCCESS
+from amers.app.cli.joint_registration import JointRequest, register_together
+from amers.app.cli.output import AsJson, print_json, show_one
+from amers.app.cli.scene_registration import failure_text, images_of, worst_status
+from amers.app.cli.scene_rows import refuse_shared_files, show_outcomes
+from amers.app.usecases.registration.register import SceneFiles
+from amers.services.sensors.parameter_sets import parameter_set_named
 
 
 def register_many(

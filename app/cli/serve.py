@@ -16,12 +16,12 @@ from typing import Annotated
 
 import typer
 
-from app import logs
-from app.cli.supervisor import Child, Supervisor
-from app.config import Settings, read_settings
-from app.db.cluster import embedded
-from app.db.ready import ready_database
-from app.errors import InputError, PortInUse
+from amers.app import logs
+from amers.app.cli.supervisor import Child, Supervisor
+from amers.app.config import Settings, read_settings
+from amers.app.db.cluster import embedded
+from amers.app.db.ready import ready_database
+from amers.app.errors import InputError, PortInUse
 
 BACKLOG = 2048
 """Connections that wait to be accepted, as while the API is restarted."""
@@ -62,14 +62,14 @@ def _children(listeners: list[socket.socket], worker: bool) -> list[Child]:
     descriptors = tuple(listener.fileno() for listener in listeners)
     api = Child(
         "the API",
-        "from app.cli.api_process import run; run([int(text) for text in sys.argv[2:]])",
+        "from amers.app.cli.api_process import run; run([int(text) for text in sys.argv[2:]])",
         ("api", *map(str, descriptors)),
         death_signal=signal.SIGKILL,
         descriptors=descriptors,
         ending_s=API_ENDING_S,
         must_start=True,
     )
-    the_worker = Child("the worker", "from app.cli.main import main; main()", ("worker",))
+    the_worker = Child("the worker", "from amers.app.cli.main import main; main()", ("worker",))
     return [api, the_worker] if worker else [api]
 
 

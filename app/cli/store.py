@@ -6,16 +6,16 @@ from typing import Annotated
 
 import typer
 
-from app.cli.deletion import giving_up_reserve
-from app.cli.output import AsJson, Row, as_size, print_json, show, show_one
-from app.cli.progress import shown_progress
-from app.cli.transaction import transaction
-from app.config import read_settings
-from app.db import engine
-from app.storage import open_storage
-from app.usecases import garbage_collection, storage_identity, usage
-from app.usecases.installation import Installation
-from app.usecases.store_verification import Finding, verify_store
+from amers.app.cli.deletion import giving_up_reserve
+from amers.app.cli.output import AsJson, Row, as_size, print_json, show, show_one
+from amers.app.cli.progress import shown_progress
+from amers.app.cli.transaction import transaction
+from amers.app.config import read_settings
+from amers.app.db import engine
+from amers.app.storage import open_storage
+from amers.app.usecases import garbage_collection, storage_identity, usage
+from amers.app.usecases.installation import Installation
+from amers.app.usecases.store_verification import Finding, verify_store
 
 
 def adopt(as_json: AsJson = False) -> None:

@@ -4,13 +4,13 @@ from typing import Annotated
 
 import typer
 
-from app.cli.deletion import giving_up_reserve
-from app.cli.output import AsJson, show, show_one
-from app.config import read_settings
-from app.db import engine
-from app.errors import InputError
-from app.storage import open_storage, trash
-from app.usecases import storage_identity
+from amers.app.cli.deletion import giving_up_reserve
+from amers.app.cli.output import AsJson, show, show_one
+from amers.app.config import read_settings
+from amers.app.db import engine
+from amers.app.errors import InputError
+from amers.app.storage import open_storage, trash
+from amers.app.usecases import storage_identity
 
 
 def list_trash(as_json: AsJson = False) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import FrameType
 
-from app.child_processes import python_command
+from amers.app.child_processes import python_command
 
 PROGRAM = """
 import ctypes, os, sys

@@ -4,11 +4,11 @@ from typing import Annotated
 
 import typer
 
-from app.cli.deletion import giving_up_reserve
-from app.cli.output import AsJson, Row, show, show_one
-from app.cli.transaction import transaction
-from app.db.tokens import Token
-from app.usecases import tokens
+from amers.app.cli.deletion import giving_up_reserve
+from amers.app.cli.output import AsJson, Row, show, show_one
+from amers.app.cli.transaction import transaction
+from amers.app.db.tokens import Token
+from amers.app.usecases import tokens
 
 
 def create(

@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from app.config import Settings, read_settings
-from app.db import engine
-from app.db.engine import Connection
-from app.db.ready import ready_database
+from amers.app.config import Settings, read_settings
+from amers.app.db import engine
+from amers.app.db.engine import Connection
+from amers.app.db.ready import ready_database
 
 
 @contextmanager

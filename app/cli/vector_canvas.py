@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from services.formats.images.canvas import write_canvas
+from amers.services.formats.images.canvas import write_canvas
 
 
 def canvas(

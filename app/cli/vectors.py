@@ -6,13 +6,13 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli.output import AsJson, print_json, show_one
-from app.errors import InputError
-from app.usecases.registered_scene import SceneModel
-from app.usecases.terrain_file import TerrainFile
-from app.usecases.vector_files import CorrectionOptions, ProjectionOptions, VectorFile
-from app.usecases.vectors import correct_file, project_file
-from services.formats.vector.pixel_coordinates import PIXEL_ORIGINS, PixelOrigin
+from amers.app.cli.output import AsJson, print_json, show_one
+from amers.app.errors import InputError
+from amers.app.usecases.registered_scene import SceneModel
+from amers.app.usecases.terrain_file import TerrainFile
+from amers.app.usecases.vector_files import CorrectionOptions, ProjectionOptions, VectorFile
+from amers.app.usecases.vectors import correct_file, project_file
+from amers.services.formats.vector.pixel_coordinates import PIXEL_ORIGINS, PixelOrigin
 
 Vectors = Annotated[
     Path, typer.Argument(exists=True, help="GeoPackage, GeoJSON, shapefile or FlatGeobuf.")

@@ -1,8 +1,8 @@
 """`amers worker`: a worker without the API."""
 
-from app import logs
-from app.config import read_settings
-from app.worker.main import run_worker
+from amers.app import logs
+from amers.app.config import read_settings
+from amers.app.worker.main import run_worker
 
 
 def worker() -> None:

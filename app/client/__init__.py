@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from app.client import Client
+from amers.app.client import Client
 
 with Client("http://127.0.0.1:8000", token) as client:
     scene = client.upload_scene(Path("scene.tif"))
@@ -11,9 +11,9 @@ with Client("http://127.0.0.1:8000", token) as client:
     print(job.verdict)
 """
 
-from app.client.client import Box, Client, Feature
-from app.client.errors import JobFailed, RequestRefused, ServiceError, ServiceFailure
-from app.client.job import Job, Progress
+from amers.app.client.client import Box, Client, Feature
+from amers.app.client.errors import JobFailed, RequestRefused, ServiceError, ServiceFailure
+from amers.app.client.job import Job, Progress
 
 __all__ = [
     "Box",

@@ -9,10 +9,10 @@ from urllib.parse import quote
 
 import httpx
 
-from app.client.connection import Connection
-from app.client.errors import JobFailed, RequestRefused, ServiceFailure, is_transient
-from app.client.job import Job, Progress, no_progress
-from app.client.upload import upload_image
+from amers.app.client.connection import Connection
+from amers.app.client.errors import JobFailed, RequestRefused, ServiceFailure, is_transient
+from amers.app.client.job import Job, Progress, no_progress
+from amers.app.client.upload import upload_image
 
 POLL_S = 0.5
 TIMEOUT_S = 60.0

@@ -1,7 +1,7 @@
 """What can go wrong between a client and a service."""
 
-from app.client.job import Job
-from app.errors import InputError
+from amers.app.client.job import Job
+from amers.app.errors import InputError
 
 BUSY = (408, 429)
 """Statuses of refusals that are about the moment: too slow, too many."""

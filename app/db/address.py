@@ -6,8 +6,8 @@ from pathlib import Path
 import psycopg
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 
-from app.errors import InputError
-from app.outages import connection_failure
+from amers.app.errors import InputError
+from amers.app.outages import connection_failure
 
 VARIABLE = "AMERS_DATABASE_URL"
 PASSWORD_VARIABLE = "AMERS_DATABASE_PASSWORD_FILE"

@@ -10,10 +10,10 @@ from uuid import UUID
 
 from sqlalchemy import select
 
-from app.db.engine import Connection
-from app.db.rows import columns_of, every
-from app.db.schema import audit
-from app.db.statements import named
+from amers.app.db.engine import Connection
+from amers.app.db.rows import columns_of, every
+from amers.app.db.schema import audit
+from amers.app.db.statements import named
 
 REMOVE_OLD = named("audit.sql", "remove_old")
 MOST_REMOVED = 100_000

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from sqlalchemy import Table
 
-from app.db.engine import Connection, driver
-from app.db.statements import CopyIn, hot
-from services.types import Array, IntArray
+from amers.app.db.engine import Connection, driver
+from amers.app.db.statements import CopyIn, hot
+from amers.services.types import Array, IntArray
 
 HEADER = b"PGCOPY\n\xff\r\n\0" + b"\0" * 8
 TRAILER = b"\xff\xff"

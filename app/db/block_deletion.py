@@ -2,9 +2,9 @@
 
 from sqlalchemy import delete, select
 
-from app.db.blocks import ID_BITS
-from app.db.engine import Connection
-from app.db.schema import block, chip_file, point, point_history, view, view_history
+from amers.app.db.blocks import ID_BITS
+from amers.app.db.engine import Connection
+from amers.app.db.schema import block, chip_file, point, point_history, view, view_history
 
 
 def delete_block(connection: Connection, number: int) -> None:

@@ -7,12 +7,17 @@ import shapely
 from sqlalchemy import Text, cast, func, literal, select
 from sqlalchemy.dialects.postgresql import JSONB, insert
 
-from app.db.blocks import COLUMNS, Block, block_of_row
-from app.db.engine import Connection
-from app.db.schema import block
-from services.formats.block.reader import BlockContents
-from services.quality.accuracy_statement import StatedAccuracy
-from services.quality.block import BlockQuality, block_accuracy, parse_quality_document, quality_document
+from amers.app.db.blocks import COLUMNS, Block, block_of_row
+from amers.app.db.engine import Connection
+from amers.app.db.schema import block
+from amers.services.formats.block.reader import BlockContents
+from amers.services.quality.accuracy_statement import StatedAccuracy
+from amers.services.quality.block import (
+    BlockQuality,
+    block_accuracy,
+    parse_quality_document,
+    quality_document,
+)
 
 
 def insert_block(

@@ -5,11 +5,11 @@ from datetime import datetime
 
 from psycopg.rows import dict_row
 
-from app.db.session import DriverConnection
-from app.db.sql_files import sql_file
-from app.db.states import BlockState
-from services.formats.block.frame_json import parse_frame
-from services.types import Frame
+from amers.app.db.session import DriverConnection
+from amers.app.db.sql_files import sql_file
+from amers.app.db.states import BlockState
+from amers.services.formats.block.frame_json import parse_frame
+from amers.services.types import Frame
 
 
 @dataclass(frozen=True)

@@ -24,13 +24,13 @@ from sqlalchemy import (
 )
 from sqlalchemy.dialects.postgresql import JSONB
 
-from app.db.block_list import BlockSummary
-from app.db.constants import text_constant
-from app.db.engine import Connection
-from app.db.rows import among, columns_of
-from app.db.schema import BlockState, block, chip_file, now, point
-from app.db.schema.base import Double
-from services.types import Array, IntArray, SurfaceHeights
+from amers.app.db.block_list import BlockSummary
+from amers.app.db.constants import text_constant
+from amers.app.db.engine import Connection
+from amers.app.db.rows import among, columns_of
+from amers.app.db.schema import BlockState, block, chip_file, now, point
+from amers.app.db.schema.base import Double
+from amers.services.types import Array, IntArray, SurfaceHeights
 
 ID_BITS = 26
 """A point's id is the number of its block times 2^26 plus its id in the block."""

@@ -2,10 +2,10 @@
 
 from sqlalchemy import func, select
 
-from app.db.engine import Connection, driver
-from app.db.schema import metadata
-from app.db.session import SETTINGS, UnusableSession
-from app.outages import POOLER, READ_ONLY, RIGHTS
+from amers.app.db.engine import Connection, driver
+from amers.app.db.schema import metadata
+from amers.app.db.session import SETTINGS, UnusableSession
+from amers.app.outages import POOLER, READ_ONLY, RIGHTS
 
 RIGHTS_MISSING = b"""select current_setting('transaction_read_only'), (
         select string_agg(concat_ws(' ', needed, 'on', name), ', ' order by name, needed)

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 from sqlalchemy import ColumnElement, Integer, Text, literal_column
 
-from app.db.schema.base import Double
-from app.db.statements import DIALECT
+from amers.app.db.schema.base import Double
+from amers.app.db.statements import DIALECT
 
 _QUOTE: Callable[[str], str] = Text().literal_processor(DIALECT)  # type: ignore[no-untyped-call]
 

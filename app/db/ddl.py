@@ -1,16 +1,16 @@
 """The script that creates the store: functions, tables, indexes, triggers and first rows.
 
-`python -m app.db.ddl` prints it. A release keeps the script in a migration, which no later change of the
-schema touches; `tests/app/test_schema.py` compares a migrated database with the schema.
+`python -m amers.app.db.ddl` prints it. A release keeps the script in a migration, which no later change
+of the schema touches; `tests/app/test_schema.py` compares a migrated database with the schema.
 """
 
 from collections.abc import Iterator
 
 from sqlalchemy.schema import CreateIndex, CreateTable, DDLElement
 
-from app.db.schema import metadata
-from app.db.sql_files import sql_file
-from app.db.statements import DIALECT
+from amers.app.db.schema import metadata
+from amers.app.db.sql_files import sql_file
+from amers.app.db.statements import DIALECT
 
 EXTENSION = "create extension if not exists postgis;\n"
 

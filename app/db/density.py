@@ -9,14 +9,14 @@ from functools import cache
 
 from sqlalchemy import BigInteger, Float, Integer, bindparam, cast, func, select
 
-from app.db.constants import integer_constant
-from app.db.engine import Connection, driver
-from app.db.features.bbox import Box
-from app.db.features.collection import Collection, Property, column_property
-from app.db.features.predicates import meets_box
-from app.db.schema import density_cell
-from app.db.schema.base import Double
-from app.db.statements import HotStatement, hot
+from amers.app.db.constants import integer_constant
+from amers.app.db.engine import Connection, driver
+from amers.app.db.features.bbox import Box
+from amers.app.db.features.collection import Collection, Property, column_property
+from amers.app.db.features.predicates import meets_box
+from amers.app.db.schema import density_cell
+from amers.app.db.schema.base import Double
+from amers.app.db.statements import HotStatement, hot
 
 COARSEST = 6
 CELL_DEG = 0.1

@@ -32,12 +32,12 @@ from sqlalchemy import (
 )
 from sqlalchemy.pool import ConnectionPoolEntry, PoolProxiedConnection
 
-from app import request_context
-from app.config import Settings
-from app.db import session
-from app.db.ready import ready_database
-from app.db.revisions import driver_connection, reach
-from app.db.session import DriverConnection
+from amers.app import request_context
+from amers.app.config import Settings
+from amers.app.db import session
+from amers.app.db.ready import ready_database
+from amers.app.db.revisions import driver_connection, reach
+from amers.app.db.session import DriverConnection
 
 Connection = sqlalchemy.Connection
 

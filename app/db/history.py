@@ -28,16 +28,16 @@ from sqlalchemy import (
 )
 from sqlalchemy.dialects.postgresql import insert
 
-from app.db import binary_copy as binary
-from app.db.blocks import in_published_block
-from app.db.constants import integer_constant, real_constant, text_constant
-from app.db.engine import Connection, driver
-from app.db.features.collection import Collection, Property, column_property
-from app.db.rows import every, first
-from app.db.schema import measure, point, point_history, view_history, view_measure
-from app.db.schema.base import Double
-from app.db.statements import HotStatement, hot, named
-from services.types import HEALTH_PRIOR_TRIES, Array, IntArray, Measures, ViewMeasures, health
+from amers.app.db import binary_copy as binary
+from amers.app.db.blocks import in_published_block
+from amers.app.db.constants import integer_constant, real_constant, text_constant
+from amers.app.db.engine import Connection, driver
+from amers.app.db.features.collection import Collection, Property, column_property
+from amers.app.db.rows import every, first
+from amers.app.db.schema import measure, point, point_history, view_history, view_measure
+from amers.app.db.schema.base import Double
+from amers.app.db.statements import HotStatement, hot, named
+from amers.services.types import HEALTH_PRIOR_TRIES, Array, IntArray, Measures, ViewMeasures, health
 
 NOT_ATTRIBUTABLE = ("not_tried", "no_chip", "nodata", "saturated", "cloud")
 """Reasons that are no fault of a point: the scene did not show it, or the point was not tried."""
@@ -52,7 +52,7 @@ _SUMS = point_history.c
 _PRIOR = real_constant(HEALTH_PRIOR_TRIES)
 _SUCCESSES = func.coalesce(_SUMS.successes, integer_constant(0))
 _EXPECTED = func.coalesce(_SUMS.expected, integer_constant(0))
-# `services.types.health` in SQL.
+# `amers.services.types.health` in SQL.
 HEALTH = func.least(real_constant(1.0), (_SUCCESSES + _PRIOR) / (_EXPECTED + _PRIOR), type_=Double)
 STATE = case(
     (point.c.suspended_at.is_not(None), text_constant("suspended")),
@@ -125,7 +125,7 @@ class PointHistory:
         attempts: scenes that showed it and tried it; each counts once.
         successes: scenes in which it was active at the end.
         expected: successes of an ordinary point: the sum of the shares of points that served.
-        health: as `services.types.health`, of successes and those expected.
+        health: as `amers.services.types.health`, of successes and those expected.
         last_attempt, last_success: None: never.
         mean_residual_px: mean distance of its measures from the registered models; None: never matched.
         mean_east_m, mean_north_m: mean of its residuals on the ground: where it may really be.

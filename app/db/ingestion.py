@@ -6,14 +6,14 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from sqlalchemy import insert
 
-from app.db import binary_copy as binary
-from app.db.blocks import ID_BITS
-from app.db.engine import Connection, driver
-from app.db.schema import chip_file, image, point, view
-from app.db.statements import CopyIn, hot, named
-from services.formats.block.reader import BlockContents
-from services.formats.block.tables import sigmas_from_covariance
-from services.types import IntArray, Progress, SurfaceHeights
+from amers.app.db import binary_copy as binary
+from amers.app.db.blocks import ID_BITS
+from amers.app.db.engine import Connection, driver
+from amers.app.db.schema import chip_file, image, point, view
+from amers.app.db.statements import CopyIn, hot, named
+from amers.services.formats.block.reader import BlockContents
+from amers.services.formats.block.tables import sigmas_from_covariance
+from amers.services.types import IntArray, Progress, SurfaceHeights
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class StoredChipFile:
     Attributes:
         name: path in the block.
         storage_key: where the storage has it.
-        chip_checksums: as in `services.formats.chips.checksums`.
+        chip_checksums: as in `amers.services.formats.chips.checksums`.
     """
 
     name: str

@@ -5,9 +5,9 @@ from uuid import UUID
 
 from sqlalchemy import Select, exists, func, or_, select, update
 
-from app.db.engine import Connection
-from app.db.rows import columns_of, only
-from app.db.schema import chip_file, installation, scene
+from amers.app.db.engine import Connection
+from amers.app.db.rows import columns_of, only
+from amers.app.db.schema import chip_file, installation, scene
 
 
 @dataclass(frozen=True)

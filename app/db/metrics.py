@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 from sqlalchemy import func, select
 
-from app.db.engine import Connection
-from app.db.schema import JobState, block, job
-from app.db.statements import named
-from services.conventions import CHIP_SIZE
+from amers.app.db.engine import Connection
+from amers.app.db.schema import JobState, block, job
+from amers.app.db.statements import named
+from amers.services.conventions import CHIP_SIZE
 
 INSTALLATION = named("metrics.sql", "installation")
 

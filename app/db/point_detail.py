@@ -9,15 +9,15 @@ from sqlalchemy import BigInteger, ColumnElement, bindparam, func, null, select
 from sqlalchemy.dialects.postgresql import aggregate_order_by
 from sqlalchemy.types import NullType
 
-from app.db.blocks import FRAME, FRAME_SIGMA_M
-from app.db.constants import text_constant
-from app.db.engine import Connection, driver
-from app.db.history import PointHistory, outcome_columns
-from app.db.rows import columns_of
-from app.db.schema import block, chip_file, image, point, point_history, view
-from app.db.statements import HotStatement, hot
-from services.formats.block.frame_json import parse_frame
-from services.types import Frame
+from amers.app.db.blocks import FRAME, FRAME_SIGMA_M
+from amers.app.db.constants import text_constant
+from amers.app.db.engine import Connection, driver
+from amers.app.db.history import PointHistory, outcome_columns
+from amers.app.db.rows import columns_of
+from amers.app.db.schema import block, chip_file, image, point, point_history, view
+from amers.app.db.statements import HotStatement, hot
+from amers.services.formats.block.frame_json import parse_frame
+from amers.services.types import Frame
 
 
 @dataclass(frozen=True)

@@ -25,22 +25,22 @@ from sqlalchemy import (
     true,
 )
 
-from app.db.binary_copy import parse_copy
-from app.db.blocks import FRAME, FRAME_SIGMA_M, ID_BITS, in_published_block, published_numbers
-from app.db.constants import integer_constant, text_constant
-from app.db.density import points_in_box
-from app.db.engine import Connection, driver
-from app.db.features.antimeridian import on_the_map
-from app.db.features.collection import Collection, column_property
-from app.db.features.predicates import geometry_from_wkb, meets_box
-from app.db.features.query import AFTER_KEY, LIMIT
-from app.db.history import point_health, view_health
-from app.db.rows import columns_of
-from app.db.schema import block, chip_file, image, point, view
-from app.db.statements import CopyOut, HotStatement, hot
-from services.formats.block.frame_json import parse_frame
-from services.formats.block.tables import covariance_from_sigmas
-from services.types import Acquisition, Array, ControlPoints, Frame, IntArray, Views
+from amers.app.db.binary_copy import parse_copy
+from amers.app.db.blocks import FRAME, FRAME_SIGMA_M, ID_BITS, in_published_block, published_numbers
+from amers.app.db.constants import integer_constant, text_constant
+from amers.app.db.density import points_in_box
+from amers.app.db.engine import Connection, driver
+from amers.app.db.features.antimeridian import on_the_map
+from amers.app.db.features.collection import Collection, column_property
+from amers.app.db.features.predicates import geometry_from_wkb, meets_box
+from amers.app.db.features.query import AFTER_KEY, LIMIT
+from amers.app.db.history import point_health, view_health
+from amers.app.db.rows import columns_of
+from amers.app.db.schema import block, chip_file, image, point, view
+from amers.app.db.statements import CopyOut, HotStatement, hot
+from amers.services.formats.block.frame_json import parse_frame
+from amers.services.formats.block.tables import covariance_from_sigmas
+from amers.services.types import Acquisition, Array, ControlPoints, Frame, IntArray, Views
 
 SERVED = and_(point.c.superseded_by.is_(None), point.c.suspended_at.is_(None))
 """Neither a better block has the point, nor an administrator has suspended it."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import psycopg
 
-from app.errors import InputError
+from amers.app.errors import InputError
 
 Connection = psycopg.Connection[tuple[Any, ...]]
 OLDEST_SERVER = 15

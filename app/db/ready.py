@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from app.config import Settings
-from app.db.cluster import embedded
-from app.db.revisions import ensure_schema
+from amers.app.config import Settings
+from amers.app.db.cluster import embedded
+from amers.app.db.revisions import ensure_schema
 
 
 @contextmanager

@@ -8,13 +8,13 @@ import shapely
 from sqlalchemy import JSON, Numeric, bindparam, cast, delete, func, insert, or_, select, update
 from sqlalchemy.dialects import postgresql
 
-from app.db.engine import Connection
-from app.db.features.antimeridian import TURNS_DEG, on_the_map
-from app.db.rows import columns_of, every, first
-from app.db.schema import reference_image, reference_point
-from app.db.statements import named
-from app.db.stored_files import NamedFile
-from services.types import Array, BoolArray, IntArray
+from amers.app.db.engine import Connection
+from amers.app.db.features.antimeridian import TURNS_DEG, on_the_map
+from amers.app.db.rows import columns_of, every, first
+from amers.app.db.schema import reference_image, reference_point
+from amers.app.db.statements import named
+from amers.app.db.stored_files import NamedFile
+from amers.services.types import Array, BoolArray, IntArray
 
 FEW_ATTEMPTS = 3
 """A place with so many attempts, fewer than half of them successful, is left out."""

@@ -7,9 +7,9 @@ from uuid import UUID, uuid4
 
 from sqlalchemy import exists, func, insert, select, update
 
-from app.db.engine import Connection
-from app.db.rows import columns_of, every, first
-from app.db.schema import registration
+from amers.app.db.engine import Connection
+from amers.app.db.rows import columns_of, every, first
+from amers.app.db.schema import registration
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,12 @@ from uuid import UUID
 import numpy as np
 from sqlalchemy import select
 
-from app.db.engine import Connection
-from app.db.history import NOT_ATTRIBUTABLE
-from app.db.schema import point
-from app.db.statements import named
-from services.quality.vanished import Days, Searches
-from services.types import Array, BoolArray, IntArray
+from amers.app.db.engine import Connection
+from amers.app.db.history import NOT_ATTRIBUTABLE
+from amers.app.db.schema import point
+from amers.app.db.statements import named
+from amers.services.quality.vanished import Days, Searches
+from amers.services.types import Array, BoolArray, IntArray
 
 
 @dataclass(frozen=True)

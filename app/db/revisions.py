@@ -10,12 +10,12 @@ from pathlib import Path
 
 import psycopg
 
-from app.db import session
-from app.db.address import unreachable
-from app.db.preparation import prepare
-from app.db.session import DriverConnection
-from app.db.sql_files import sql_file
-from app.errors import InputError
+from amers.app.db import session
+from amers.app.db.address import unreachable
+from amers.app.db.preparation import prepare
+from amers.app.db.session import DriverConnection
+from amers.app.db.sql_files import sql_file
+from amers.app.errors import InputError
 
 OWN_WARNING = "01000"
 """SQLSTATE of a warning that a statement raises."""
@@ -91,7 +91,7 @@ def upgrade(dsn: str) -> None:
 
 def migrations_folder() -> Path:
     """Where the migrations are installed."""
-    return Path(str(resources.files("migrations")))
+    return Path(str(resources.files("amers.migrations")))
 
 
 def newest_revision() -> str:

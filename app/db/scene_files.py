@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import Any
 from uuid import UUID
 
-from app.db.engine import Connection
-from app.db.rows import every
-from app.db.statements import named
+from amers.app.db.engine import Connection
+from amers.app.db.rows import every
+from amers.app.db.statements import named
 
 SCENE_FILES = named("scenes.sql", "scene_files")
 

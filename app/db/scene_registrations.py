@@ -6,9 +6,9 @@ from datetime import datetime
 from typing import Any, Literal
 from uuid import UUID
 
-from app.db.engine import Connection
-from app.db.rows import every
-from app.db.statements import named
+from amers.app.db.engine import Connection
+from amers.app.db.rows import every
+from amers.app.db.statements import named
 
 SCENE_REGISTRATIONS = named("scenes.sql", "scene_registrations")
 

@@ -22,10 +22,10 @@ from sqlalchemy import (
 )
 from sqlalchemy.dialects.postgresql import JSONB
 
-from app.db.engine import Connection
-from app.db.rows import among, columns_of, every, first, only
-from app.db.schema import SceneState, hours, now, scene, upload, uptime_s
-from services.types import Acquisition, Array
+from amers.app.db.engine import Connection
+from amers.app.db.rows import among, columns_of, every, first, only
+from amers.app.db.schema import SceneState, hours, now, scene, upload, uptime_s
+from amers.services.types import Acquisition, Array
 
 LONGEST_UPLOAD_HOURS = 24
 

@@ -22,7 +22,7 @@ from psycopg.conninfo import conninfo_to_dict, make_conninfo
 from psycopg.pq import ExecStatus
 from psycopg.pq.abc import PGconn, PGresult
 
-from app.outages import POOLER, outage_of
+from amers.app.outages import POOLER, outage_of
 
 DriverConnection = psycopg.Connection[tuple[Any, ...]]
 

@@ -5,4 +5,4 @@ from importlib import resources
 
 def sql_file(name: str) -> str:
     """The text of a file of `app/db/sql`."""
-    return resources.files("app.db").joinpath("sql", name).read_text()
+    return resources.files("amers.app.db").joinpath("sql", name).read_text()

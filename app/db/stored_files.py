@@ -7,11 +7,11 @@ import numpy as np
 from sqlalchemy import delete, select, update
 from sqlalchemy.dialects.postgresql import insert
 
-from app.db.blocks import ID_BITS
-from app.db.engine import Connection
-from app.db.rows import every
-from app.db.schema import chip_file, clock, damaged_file, result_file, upload
-from app.db.statements import named
+from amers.app.db.blocks import ID_BITS
+from amers.app.db.engine import Connection
+from amers.app.db.rows import every
+from amers.app.db.schema import chip_file, clock, damaged_file, result_file, upload
+from amers.app.db.statements import named
 
 NAMED_FILES = named("stored_files.sql", "named_files")
 FOLDERS_IN_PROGRESS = named("stored_files.sql", "folders_in_progress")

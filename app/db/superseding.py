@@ -12,14 +12,14 @@ from typing import Any
 import shapely
 from sqlalchemy import LargeBinary, func, select
 
-from app.db.blocks import FRAME_SIGMA_M, ID_BITS
-from app.db.constants import text_constant
-from app.db.density import count_unserved_cells
-from app.db.engine import Connection, driver
-from app.db.features.antimeridian import on_the_map
-from app.db.schema import block
-from app.db.schema.base import Double
-from app.db.statements import HotStatement, hot, named
+from amers.app.db.blocks import FRAME_SIGMA_M, ID_BITS
+from amers.app.db.constants import text_constant
+from amers.app.db.density import count_unserved_cells
+from amers.app.db.engine import Connection, driver
+from amers.app.db.features.antimeridian import on_the_map
+from amers.app.db.schema import block
+from amers.app.db.schema.base import Double
+from amers.app.db.statements import HotStatement, hot, named
 
 SAME_PLACE_M = 10.0
 """Horizontally: two fifths of what a chip of half a metre shows to either side of its centre."""

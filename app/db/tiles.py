@@ -25,17 +25,17 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import NullType
 
-from app.db.constants import integer_constant, text_constant
-from app.db.density import AREA_KM2, COARSEST, SERVED
-from app.db.engine import Connection, driver
-from app.db.features.collection import Viewer
-from app.db.features.outlines import BLOCKS
-from app.db.features.predicates import meets_box
-from app.db.history import HEALTH
-from app.db.points import POINTS
-from app.db.schema import audit, block, density_cell, point, point_history, registration
-from app.db.schema.base import Double
-from app.db.statements import HotStatement, hot
+from amers.app.db.constants import integer_constant, text_constant
+from amers.app.db.density import AREA_KM2, COARSEST, SERVED
+from amers.app.db.engine import Connection, driver
+from amers.app.db.features.collection import Viewer
+from amers.app.db.features.outlines import BLOCKS
+from amers.app.db.features.predicates import meets_box
+from amers.app.db.history import HEALTH
+from amers.app.db.points import POINTS
+from amers.app.db.schema import audit, block, density_cell, point, point_history, registration
+from amers.app.db.schema.base import Double
+from amers.app.db.statements import HotStatement, hot
 
 EXTENT = 4096
 BUFFER = 64

@@ -7,10 +7,10 @@ from uuid import UUID, uuid4
 from sqlalchemy import Text, and_, bindparam, cast, delete, exists, func, or_, select, update
 from sqlalchemy.dialects.postgresql import insert
 
-from app.db.engine import Connection, driver
-from app.db.rows import columns_of, every, first, only
-from app.db.schema import ended_session, job, now, token
-from app.db.statements import HotStatement, hot
+from amers.app.db.engine import Connection, driver
+from amers.app.db.rows import columns_of, every, first, only
+from amers.app.db.schema import ended_session, job, now, token
+from amers.app.db.statements import HotStatement, hot
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from uuid import UUID, uuid4
 
 from sqlalchemy import Text, and_, cast, delete, exists, func, insert, select, update
 
-from app.db.engine import Connection
-from app.db.rows import among, columns_of, first, only
-from app.db.schema import UploadPurpose, hours, job, now, upload, uptime_s
+from amers.app.db.engine import Connection
+from amers.app.db.rows import among, columns_of, first, only
+from amers.app.db.schema import UploadPurpose, hours, job, now, upload, uptime_s
 
 LIFE_HOURS = 24
 """An upload is given up so long after its last piece."""

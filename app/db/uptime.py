@@ -7,8 +7,8 @@ from datetime import date
 
 from sqlalchemy import extract, func, select, update
 
-from app.db.engine import Connection
-from app.db.schema import clock, uptime, uptime_s
+from amers.app.db.engine import Connection
+from amers.app.db.schema import clock, uptime, uptime_s
 
 
 def advance(connection: Connection, most_s: float) -> None:

@@ -17,9 +17,9 @@ from sqlalchemy import (
     union_all,
 )
 
-from app.db.engine import Connection
-from app.db.rows import every
-from app.db.schema import job, scene, upload
+from amers.app.db.engine import Connection
+from amers.app.db.rows import every
+from amers.app.db.schema import job, scene, upload
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Files by key in a folder or a bucket: written completely or not at all, and read by position."""
 
-from app.config import Settings
-from app.storage.chips import StoredChips
-from app.storage.files import (
+from amers.app.config import Settings
+from amers.app.storage.chips import StoredChips
+from amers.app.storage.files import (
     KEY,
     UNFINISHED,
     FileState,
@@ -11,9 +11,9 @@ from app.storage.files import (
     Writing,
     chips_key,
 )
-from app.storage.folder import Storage
-from app.storage.marker import MARKER, Marker, read_marker, write_marker
-from app.storage.proof import Proof
+from amers.app.storage.folder import Storage
+from amers.app.storage.marker import MARKER, Marker, read_marker, write_marker
+from amers.app.storage.proof import Proof
 
 __all__ = [
     "KEY",
@@ -45,6 +45,6 @@ def open_storage(settings: Settings) -> Storage:
     folder = settings.data_folder / "storage"
     if settings.storage_url is None:
         return Storage(folder, proof=Proof())
-    from app.storage.bucket import BucketStorage  # 0.1 s and 10 MB that a folder does not need
+    from amers.app.storage.bucket import BucketStorage  # 0.1 s and 10 MB that a folder does not need
 
     return BucketStorage(folder, settings.storage_url, proof=Proof())

@@ -13,10 +13,10 @@ import obstore
 from obstore.exceptions import BaseError
 from obstore.store import S3Store
 
-from app.errors import InputError, NotFound, StorageOutage
-from app.storage.files import COPY_BYTES, UNFINISHED, FileState, RangeReader, checked_key
-from app.storage.folder import Storage
-from app.storage.marker import MARKER, Marker, parse_marker
+from amers.app.errors import InputError, NotFound, StorageOutage
+from amers.app.storage.files import COPY_BYTES, UNFINISHED, FileState, RangeReader, checked_key
+from amers.app.storage.folder import Storage
+from amers.app.storage.marker import MARKER, Marker, parse_marker
 
 RETRIES = 3
 RETRY_TIMEOUT = timedelta(seconds=20)

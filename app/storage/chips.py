@@ -9,13 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.errors import DamagedFile, NotFound
-from app.storage.files import RangeReader
-from app.storage.folder import Storage
-from services.errors import FormatError
-from services.formats.chips.checksums import CHECKSUM, Checksums, damaged_rows
-from services.formats.chips.npy_files import MAX_HEADER_BYTES, ChipFile, parse_chip_header
-from services.types import ChipArray
+from amers.app.errors import DamagedFile, NotFound
+from amers.app.storage.files import RangeReader
+from amers.app.storage.folder import Storage
+from amers.services.errors import FormatError
+from amers.services.formats.chips.checksums import CHECKSUM, Checksums, damaged_rows
+from amers.services.formats.chips.npy_files import MAX_HEADER_BYTES, ChipFile, parse_chip_header
+from amers.services.types import ChipArray
 
 OPEN_CHIP_FILES = 64
 ROWS_NAMED = 10
@@ -32,7 +32,7 @@ class _OpenChipFile:
 
 
 class StoredChips:
-    """A `services.types.ChipSource` of the chip files in the storage, which are named by their keys.
+    """The chip files in the storage, named by their keys, as a `amers.services.types.ChipSource`.
 
     Files stay open with their headers parsed and their checksums read, so that a read is one `pread` or
     one range request. Threads may share it.

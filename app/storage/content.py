@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import BinaryIO
 
-from services.errors import FormatError
-from services.formats.chips.checksums import Checksums, ChipHasher
-from services.formats.chips.npy_files import MAX_HEADER_BYTES, parse_chip_header
+from amers.services.errors import FormatError
+from amers.services.formats.chips.checksums import Checksums, ChipHasher
+from amers.services.formats.chips.npy_files import MAX_HEADER_BYTES, parse_chip_header
 
 READ_BYTES = 1 << 20
 

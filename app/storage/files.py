@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
-from app.errors import InputError, TooLarge
+from amers.app.errors import InputError, TooLarge
 
 UNFINISHED = "unfinished"
 COPY_BYTES = 1 << 20

@@ -12,9 +12,9 @@ from tempfile import TemporaryDirectory, mkstemp
 from typing import BinaryIO
 from uuid import UUID, uuid4
 
-from app.errors import InputError, NotFound, StorageOutage
-from app.outages import outage_of
-from app.storage.files import (
+from amers.app.errors import InputError, NotFound, StorageOutage
+from amers.app.outages import outage_of
+from amers.app.storage.files import (
     COPY_BYTES,
     UNFINISHED,
     FileReader,
@@ -27,8 +27,8 @@ from app.storage.files import (
     lock,
     locked,
 )
-from app.storage.marker import MARKER, Marker, parse_marker
-from app.storage.proof import NOT_MOUNTED, Proof
+from amers.app.storage.marker import MARKER, Marker, parse_marker
+from amers.app.storage.proof import NOT_MOUNTED, Proof
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 from uuid import UUID
 
-from app.errors import InputError
+from amers.app.errors import InputError
 
 if TYPE_CHECKING:
-    from app.storage.folder import Storage
+    from amers.app.storage.folder import Storage
 
 MARKER = "installation.json"
 

@@ -12,8 +12,8 @@ from contextlib import contextmanager
 from typing import Protocol
 from uuid import UUID
 
-from app.errors import InputError, StorageOutage
-from app.storage.marker import MARKER, Marker
+from amers.app.errors import InputError, StorageOutage
+from amers.app.storage.marker import MARKER, Marker
 
 VALID_S = 1.0
 UNKNOWN = "it is not known yet whether the storage of files is that of the database"

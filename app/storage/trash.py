@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import date
 
-from app.storage.folder import Storage
+from amers.app.storage.folder import Storage
 
 TRASH = "trash"
 BATCH = re.compile(r"(\d{4}-\d\d-\d\d)_(\d+)h")

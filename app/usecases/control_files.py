@@ -7,25 +7,25 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from app.errors import InputError
-from app.usecases.marked_files import PointStatements, read_marked
-from app.usecases.registration.reference_source import COMMON_SIGMA_PX, LOCAL_SIGMA_PX
-from app.usecases.terrain_file import TerrainFile, read_terrain
-from services.adjustment.known_images import KnownImages
-from services.errors import VerticalDatumError
-from services.formats.addresses import FilePlace
-from services.formats.adjusted_images import read_adjusted_images
-from services.formats.block.document_json import BLOCK_JSON
-from services.formats.block.reader import FolderChips, file_sha256, read_block
-from services.formats.images.scenes import product_sigma_m, read_scene
-from services.imagery.scene import Scene
-from services.matching.reference_image import Reference
-from services.production.control import Control
-from services.production.control_points import ControlBlock
-from services.production.height_control import ControlHeights
-from services.production.ortho_control import ControlOrtho
-from services.sensors.ortho import OrthoModel
-from services.types import Frame
+from amers.app.errors import InputError
+from amers.app.usecases.marked_files import PointStatements, read_marked
+from amers.app.usecases.registration.reference_source import COMMON_SIGMA_PX, LOCAL_SIGMA_PX
+from amers.app.usecases.terrain_file import TerrainFile, read_terrain
+from amers.services.adjustment.known_images import KnownImages
+from amers.services.errors import VerticalDatumError
+from amers.services.formats.addresses import FilePlace
+from amers.services.formats.adjusted_images import read_adjusted_images
+from amers.services.formats.block.document_json import BLOCK_JSON
+from amers.services.formats.block.reader import FolderChips, file_sha256, read_block
+from amers.services.formats.images.scenes import product_sigma_m, read_scene
+from amers.services.imagery.scene import Scene
+from amers.services.matching.reference_image import Reference
+from amers.services.production.control import Control
+from amers.services.production.control_points import ControlBlock
+from amers.services.production.height_control import ControlHeights
+from amers.services.production.ortho_control import ControlOrtho
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Frame
 
 IMAGES_NPZ = "images.npz"
 """The adjusted images of a block in its folder BLOCK.adjustment."""

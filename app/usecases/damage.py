@@ -4,11 +4,11 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from app.db import stored_files
-from app.db.engine import Database
-from app.errors import DamagedFile, InputError, NotFound
-from app.storage import Storage, StoredChips
-from app.storage.content import read_content
+from amers.app.db import stored_files
+from amers.app.db.engine import Database
+from amers.app.errors import DamagedFile, InputError, NotFound
+from amers.app.storage import Storage, StoredChips
+from amers.app.storage.content import read_content
 
 log = logging.getLogger(__name__)
 

@@ -6,28 +6,28 @@ from pathlib import Path
 
 import numpy as np
 
-from app.config import Settings
-from app.db import engine
-from app.usecases import storage_identity
-from app.usecases.blocks import lifecycle
-from app.usecases.image_production import ProductionImages, run_production
-from app.usecases.production import BlockIdentity
-from app.usecases.registration.control_sources import points_of_store
-from app.usecases.registration.register import (
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.usecases import storage_identity
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.image_production import ProductionImages, run_production
+from amers.app.usecases.production import BlockIdentity
+from amers.app.usecases.registration.control_sources import points_of_store
+from amers.app.usecases.registration.register import (
     ControlSources,
     SceneFiles,
     image_key,
     record_registration,
     run_registration,
 )
-from app.usecases.registration.result_folder import replacing
-from services.adjustment.intersection import intersect
-from services.formats.images.raster import write_raster
-from services.geodesy import east_north_up, lon_lat_h_from_east_north_up
-from services.production.from_images import Production, ProductionOptions
-from services.quality.accuracy import Quantile, sample_quantile
-from services.registration.on_points import Registration
-from services.simulation.view import (
+from amers.app.usecases.registration.result_folder import replacing
+from amers.services.adjustment.intersection import intersect
+from amers.services.formats.images.raster import write_raster
+from amers.services.geodesy import east_north_up, lon_lat_h_from_east_north_up
+from amers.services.production.from_images import Production, ProductionOptions
+from amers.services.quality.accuracy import Quantile, sample_quantile
+from amers.services.registration.on_points import Registration
+from amers.services.simulation.view import (
     SimulatedView,
     ViewPlan,
     simulate_block,
@@ -35,8 +35,8 @@ from services.simulation.view import (
     true_ground,
     true_line_sample,
 )
-from services.simulation.world import World, make_world
-from services.types import Array, Observations, Progress, part_of
+from amers.services.simulation.world import World, make_world
+from amers.services.types import Array, Observations, Progress, part_of
 
 
 @dataclass(frozen=True)

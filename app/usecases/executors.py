@@ -7,9 +7,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from app.child_processes import leave_out_working_folder
-from app.errors import InputError
-from app.one_thread import use_one_thread
+from amers.app.child_processes import leave_out_working_folder
+from amers.app.errors import InputError
+from amers.app.one_thread import use_one_thread
 
 _LOST_WORKERS = 3
 """How often a task is given to another worker after its own was lost."""

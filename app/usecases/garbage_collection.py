@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from uuid import UUID
 
-from app.db import blocks, scenes, uploads, uptime
-from app.db.engine import Connection, Database
-from app.db.jobs import attempts
-from app.storage import Storage, trash
-from app.storage.trash import Moment
+from amers.app.db import blocks, scenes, uploads, uptime
+from amers.app.db.engine import Connection, Database
+from amers.app.db.jobs import attempts
+from amers.app.storage import Storage, trash
+from amers.app.storage.trash import Moment
 
 SHARE_AT_ONCE = 0.05
 FILES_AT_ONCE = 100

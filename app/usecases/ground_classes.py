@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from services.formats.ground_masks import LandCover, any_of, read_ground_mask, read_land_cover
-from services.quality.density import GroundMask
-from services.types import Array, BoolArray, ControlPoints
+from amers.services.formats.ground_masks import LandCover, any_of, read_ground_mask, read_land_cover
+from amers.services.quality.density import GroundMask
+from amers.services.types import Array, BoolArray, ControlPoints
 
 UNSTEADY = ("water", "snow and ice")
 """Land cover that looks different every day: it gets no points."""

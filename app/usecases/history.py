@@ -2,11 +2,11 @@
 
 from uuid import UUID
 
-from app.db import history, registrations, superseding
-from app.db.engine import Connection
-from app.db.history import PointHistory
-from app.errors import Conflict, InputError, NotFound
-from services.registration.on_points import Registration
+from amers.app.db import history, registrations, superseding
+from amers.app.db.engine import Connection
+from amers.app.db.history import PointHistory
+from amers.app.errors import Conflict, InputError, NotFound
+from amers.services.registration.on_points import Registration
 
 MOST_HISTORIES = 1000
 LONGEST_REASON = 500

@@ -12,30 +12,30 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from app.usecases.control_files import IMAGES_NPZ, ControlFiles, control_inputs, read_control
-from app.usecases.executors import ComputeOptions, open_executor
-from app.usecases.ground_classes import GroundFiles, read_ground
-from app.usecases.image_selection import ITEMS
-from app.usecases.production import BlockIdentity, block_metadata, points_per_km2, refuse_existing
-from app.usecases.registration.result_folder import replacing
-from services.adjustment.known_images import KnownImages
-from services.errors import FormatError
-from services.formats.addresses import Address, FilePlace
-from services.formats.adjusted_images import write_adjusted_images
-from services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification
-from services.formats.block.writer import write_block
-from services.formats.images.scenes import read_scene
-from services.formats.stac.catalogue import read_catalogue
-from services.formats.stac.scenes import image_place, read_item_scene
-from services.formats.work_folder import WorkFolder
-from services.imagery.scene import Scene
-from services.production.from_images import Production, ProductionOptions, produce_points
-from services.reports.block_adjustment import adjustment_document, adjustment_report, points_csv
-from services.reports.block_adjustment_pages import format_adjustment_html
-from services.sensors.refined import refined_rpc
-from services.sensors.rpc import RpcModel
-from services.tasks import Work
-from services.types import Progress, no_progress, part_of
+from amers.app.usecases.control_files import IMAGES_NPZ, ControlFiles, control_inputs, read_control
+from amers.app.usecases.executors import ComputeOptions, open_executor
+from amers.app.usecases.ground_classes import GroundFiles, read_ground
+from amers.app.usecases.image_selection import ITEMS
+from amers.app.usecases.production import BlockIdentity, block_metadata, points_per_km2, refuse_existing
+from amers.app.usecases.registration.result_folder import replacing
+from amers.services.adjustment.known_images import KnownImages
+from amers.services.errors import FormatError
+from amers.services.formats.addresses import Address, FilePlace
+from amers.services.formats.adjusted_images import write_adjusted_images
+from amers.services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification
+from amers.services.formats.block.writer import write_block
+from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.stac.catalogue import read_catalogue
+from amers.services.formats.stac.scenes import image_place, read_item_scene
+from amers.services.formats.work_folder import WorkFolder
+from amers.services.imagery.scene import Scene
+from amers.services.production.from_images import Production, ProductionOptions, produce_points
+from amers.services.reports.block_adjustment import adjustment_document, adjustment_report, points_csv
+from amers.services.reports.block_adjustment_pages import format_adjustment_html
+from amers.services.sensors.refined import refined_rpc
+from amers.services.sensors.rpc import RpcModel
+from amers.services.tasks import Work
+from amers.services.types import Progress, no_progress, part_of
 
 
 @dataclass(frozen=True)

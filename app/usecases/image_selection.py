@@ -10,22 +10,22 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from app.usecases.registration.result_folder import replacing
-from services.formats.addresses import without_query
-from services.formats.stac.catalogue import StacCatalogue, parse_area, read_catalogue
-from services.formats.stac.writer import write_items
-from services.formats.text_files import load_json, read_text
-from services.formats.vector.cell_layers import write_cell_layer
-from services.production.image_selection import ImageSelection, SelectionOptions, select_images
-from services.reports.selection import (
+from amers.app.usecases.registration.result_folder import replacing
+from amers.services.formats.addresses import without_query
+from amers.services.formats.stac.catalogue import StacCatalogue, parse_area, read_catalogue
+from amers.services.formats.stac.writer import write_items
+from amers.services.formats.text_files import load_json, read_text
+from amers.services.formats.vector.cell_layers import write_cell_layer
+from amers.services.production.image_selection import ImageSelection, SelectionOptions, select_images
+from amers.services.reports.selection import (
     SelectionReport,
     SourceFacts,
     overlap_csv,
     selection_document,
     selection_report,
 )
-from services.reports.selection_pages import format_selection_html
-from services.types import Progress, no_progress, part_of
+from amers.services.reports.selection_pages import format_selection_html
+from amers.services.types import Progress, no_progress, part_of
 
 ITEMS, CELLS, OVERLAP = "selection.json", "cells.gpkg", "overlap.csv"
 LIMIT_PROPERTY = "amers:cloud_limit_percent"

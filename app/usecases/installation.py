@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from app.config import Settings
-from app.db.engine import Database
-from app.storage import Storage
+from amers.app.config import Settings
+from amers.app.db.engine import Database
+from amers.app.storage import Storage
 
 
 @dataclass(frozen=True)

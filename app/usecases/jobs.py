@@ -14,18 +14,18 @@ from uuid import UUID
 
 import psycopg
 
-from app.auth import Scope, may_access, owner_filter, require
-from app.config import Settings
-from app.db.engine import Connection, Database
-from app.db.jobs import attempts, jobs
-from app.db.jobs import progress as job_progress
-from app.db.jobs.attempts import LostJob
-from app.db.jobs.jobs import Job, JobFilter
-from app.db.jobs.progress import JobMessage, Outlook
-from app.db.scenes import keeping_files, scene_names
-from app.db.schema import JobResponse
-from app.db.tokens import Token
-from app.errors import (
+from amers.app.auth import Scope, may_access, owner_filter, require
+from amers.app.config import Settings
+from amers.app.db.engine import Connection, Database
+from amers.app.db.jobs import attempts, jobs
+from amers.app.db.jobs import progress as job_progress
+from amers.app.db.jobs.attempts import LostJob
+from amers.app.db.jobs.jobs import Job, JobFilter
+from amers.app.db.jobs.progress import JobMessage, Outlook
+from amers.app.db.scenes import keeping_files, scene_names
+from amers.app.db.schema import JobResponse
+from amers.app.db.tokens import Token
+from amers.app.errors import (
     AmersError,
     Conflict,
     DamagedFile,
@@ -36,21 +36,21 @@ from app.errors import (
     is_no_memory,
     is_no_room,
 )
-from app.outages import outage_of
-from app.storage import Storage
-from app.usecases import quotas, storage_identity
-from app.usecases.blocks.export import EXPORT_BLOCK
-from app.usecases.blocks.ingestion import INGEST_BLOCK
-from app.usecases.blocks.quality_job import ASSESS_BLOCK
-from app.usecases.blocks.renewal_job import RENEW_BLOCK
-from app.usecases.damage import report_damage
-from app.usecases.orthorectification import ORTHORECTIFY
-from app.usecases.processes import Process, Work, WorkFailed
-from app.usecases.registration.job import REGISTER_SCENE
-from app.usecases.registration.joint_job import REGISTER_SCENES
-from app.usecases.scene_map import MAP_SCENE
-from app.usecases.scene_view import VIEW_SCENE
-from app.usecases.vector_job import CORRECT_VECTORS, PROJECT_VECTORS
+from amers.app.outages import outage_of
+from amers.app.storage import Storage
+from amers.app.usecases import quotas, storage_identity
+from amers.app.usecases.blocks.export import EXPORT_BLOCK
+from amers.app.usecases.blocks.ingestion import INGEST_BLOCK
+from amers.app.usecases.blocks.quality_job import ASSESS_BLOCK
+from amers.app.usecases.blocks.renewal_job import RENEW_BLOCK
+from amers.app.usecases.damage import report_damage
+from amers.app.usecases.orthorectification import ORTHORECTIFY
+from amers.app.usecases.processes import Process, Work, WorkFailed
+from amers.app.usecases.registration.job import REGISTER_SCENE
+from amers.app.usecases.registration.joint_job import REGISTER_SCENES
+from amers.app.usecases.scene_map import MAP_SCENE
+from amers.app.usecases.scene_view import VIEW_SCENE
+from amers.app.usecases.vector_job import CORRECT_VECTORS, PROJECT_VECTORS
 
 PROCESSES: dict[str, Process] = {
     process.id: process

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from app.errors import InputError
-from services.formats.addresses import FilePlace
-from services.formats.gcp.marked_points import MarkedPoints
-from services.formats.gcp.reader import StatedByCaller, read_marked_ground
-from services.imagery.scene import Scene
-from services.production.marked_control import MarkedGround
-from services.quality.check_points import MARKING_SIGMA_PX
-from services.types import Array, Frame, IntArray, Observations
+from amers.app.errors import InputError
+from amers.services.formats.addresses import FilePlace
+from amers.services.formats.gcp.marked_points import MarkedPoints
+from amers.services.formats.gcp.reader import StatedByCaller, read_marked_ground
+from amers.services.imagery.scene import Scene
+from amers.services.production.marked_control import MarkedGround
+from amers.services.quality.check_points import MARKING_SIGMA_PX
+from amers.services.types import Array, Frame, IntArray, Observations
 
 
 @dataclass(frozen=True)

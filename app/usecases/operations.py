@@ -4,12 +4,12 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from app.db import audit, metrics
-from app.db.audit import Change
-from app.db.engine import Connection
-from app.db.jobs import progress
-from app.db.metrics import Gauges
-from app.errors import InputError
+from amers.app.db import audit, metrics
+from amers.app.db.audit import Change
+from amers.app.db.engine import Connection
+from amers.app.db.jobs import progress
+from amers.app.db.metrics import Gauges
+from amers.app.errors import InputError
 
 MOST_CHANGES = 1000
 

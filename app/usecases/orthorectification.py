@@ -10,35 +10,40 @@ from uuid import UUID
 
 import numpy as np
 
-from app.auth import Scope
-from app.db import scenes
-from app.db.engine import Connection
-from app.db.tokens import Token
-from app.errors import InputError, TooLarge
-from app.usecases import quotas
-from app.usecases.damage import named_by_row, suspecting_damage
-from app.usecases.processes import Commit, Process, Work
-from app.usecases.quotas import FREE_ROOM
-from app.usecases.registered_scene import REFINED_NAME
-from app.usecases.results import store_results
-from app.usecases.scene_inputs import (
+from amers.app.auth import Scope
+from amers.app.db import scenes
+from amers.app.db.engine import Connection
+from amers.app.db.tokens import Token
+from amers.app.errors import InputError, TooLarge
+from amers.app.usecases import quotas
+from amers.app.usecases.damage import named_by_row, suspecting_damage
+from amers.app.usecases.processes import Commit, Process, Work
+from amers.app.usecases.quotas import FREE_ROOM
+from amers.app.usecases.registered_scene import REFINED_NAME
+from amers.app.usecases.results import store_results
+from amers.app.usecases.scene_inputs import (
     check_file_names,
     check_scene,
     naming,
     present_scene,
     registration_files,
 )
-from app.usecases.scenes import local_image, stored_keys
-from app.usecases.terrain_file import TerrainFile, read_terrain
-from services.formats.elevation.geoid import vertical_crs
-from services.formats.images.bands import one_band
-from services.formats.images.ortho import write_cog
-from services.formats.images.raster import RasterImage
-from services.formats.images.scenes import read_scene
-from services.imagery.scene import Scene, scene_gsd_m
-from services.map_grid import MapGrid, check_map_code
-from services.orthorectification.rectify import OrthoOptions, OrthoWindow, choose_grid, orthorectify
-from services.types import Progress, no_progress
+from amers.app.usecases.scenes import local_image, stored_keys
+from amers.app.usecases.terrain_file import TerrainFile, read_terrain
+from amers.services.formats.elevation.geoid import vertical_crs
+from amers.services.formats.images.bands import one_band
+from amers.services.formats.images.ortho import write_cog
+from amers.services.formats.images.raster import RasterImage
+from amers.services.formats.images.scenes import read_scene
+from amers.services.imagery.scene import Scene, scene_gsd_m
+from amers.services.map_grid import MapGrid, check_map_code
+from amers.services.orthorectification.rectify import (
+    OrthoOptions,
+    OrthoWindow,
+    choose_grid,
+    orthorectify,
+)
+from amers.services.types import Progress, no_progress
 
 ORTHO_NAME = "ortho.tif"
 FINEST_GSD = 0.5

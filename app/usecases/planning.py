@@ -11,23 +11,23 @@ import numpy as np
 import shapely
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from app.errors import InputError
-from app.usecases.registration.result_folder import replacing
-from services.formats.stac.catalogue import read_catalogue
-from services.formats.text_files import load_json, read_text
-from services.geodesy import metres_per_degree
-from services.imagery.catalogue import ImageCatalogue
-from services.production.block_plan import (
+from amers.app.errors import InputError
+from amers.app.usecases.registration.result_folder import replacing
+from amers.services.formats.stac.catalogue import read_catalogue
+from amers.services.formats.text_files import load_json, read_text
+from amers.services.geodesy import metres_per_degree
+from amers.services.imagery.catalogue import ImageCatalogue
+from amers.services.production.block_plan import (
     BlockPlan,
     PlannedHeights,
     PlannedImage,
     PlannedSite,
     SiteSigmas,
 )
-from services.production.planning import forecast
-from services.reports.plan import PlanReport, plan_document, points_csv
-from services.reports.plan_pages import format_plan_html
-from services.types import Progress, no_progress
+from amers.services.production.planning import forecast
+from amers.services.reports.plan import PlanReport, plan_document, points_csv
+from amers.services.reports.plan_pages import format_plan_html
+from amers.services.types import Progress, no_progress
 
 _MAX_CANDIDATES = 200
 

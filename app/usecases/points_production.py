@@ -8,25 +8,25 @@ from typing import Any
 
 import numpy as np
 
-from app.errors import InputError
-from app.usecases.production import (
+from amers.app.errors import InputError
+from amers.app.usecases.production import (
     BlockIdentity,
     block_metadata,
     fewest_views,
     image_accuracy,
     refuse_existing,
 )
-from app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
-from services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification
-from services.formats.block.writer import write_block
-from services.formats.gcp.base_chips import open_base_chip, read_base_chips
-from services.formats.gcp.reader import StatedByCaller, read_ground_points
-from services.formats.images.bands import parse_bands
-from services.formats.images.scenes import read_scene
-from services.production.from_chips import OwnChips, produce_points_with_chips
-from services.production.from_points import KnownPointOptions, KnownPoints, produce_known_points
-from services.sensors.rpc import RpcModel
-from services.types import Frame, GroundPoints, Progress, no_progress, part_of
+from amers.app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
+from amers.services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification
+from amers.services.formats.block.writer import write_block
+from amers.services.formats.gcp.base_chips import open_base_chip, read_base_chips
+from amers.services.formats.gcp.reader import StatedByCaller, read_ground_points
+from amers.services.formats.images.bands import parse_bands
+from amers.services.formats.images.scenes import read_scene
+from amers.services.production.from_chips import OwnChips, produce_points_with_chips
+from amers.services.production.from_points import KnownPointOptions, KnownPoints, produce_known_points
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Frame, GroundPoints, Progress, no_progress, part_of
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class KnownPointFiles:
     """Points of another base in a file, and the images or the folder that give them chips.
 
     Attributes:
-        points: in any format of `services.formats.gcp.reader`.
+        points: in any format of `amers.services.formats.gcp.reader`.
         images: with registered models, or ortho-images; the most accurate first. None where the base has
             chips of its own.
         chips: folder of the chips of the base; None where images give them.
-        chip_origin: see `services.formats.gcp.base_chips.read_base_chips`.
+        chip_origin: see `amers.services.formats.gcp.base_chips.read_base_chips`.
         stated: what the file of the points does not state.
         point_sigma_m: horizontal and up, one standard deviation, of points whose file states none.
         terrain: gives the heights of points without any.
@@ -47,7 +47,7 @@ class KnownPointFiles:
         sigma_m: accuracy of the images' models, metres; by default that of the producer or the sensor.
         frame_sigma_m, frame_sigma_up_m: error on the Earth that all points of the base share, metres;
             None when unknown.
-        bands: see `services.formats.images.bands.parse_bands`.
+        bands: see `amers.services.formats.images.bands.parse_bands`.
     """
 
     points: Path

@@ -7,16 +7,16 @@ from uuid import UUID
 
 from pydantic import TypeAdapter, ValidationError
 
-from app.auth import Scope
-from app.config import Settings
-from app.db.engine import Connection, Database
-from app.db.jobs.jobs import Job
-from app.db.tokens import Token
-from app.errors import AmersError, InputError
-from app.json_values import unusable_value
-from app.storage import Storage
-from services.docstrings import attribute_descriptions
-from services.types import Progress
+from amers.app.auth import Scope
+from amers.app.config import Settings
+from amers.app.db.engine import Connection, Database
+from amers.app.db.jobs.jobs import Job
+from amers.app.db.tokens import Token
+from amers.app.errors import AmersError, InputError
+from amers.app.json_values import unusable_value
+from amers.app.storage import Storage
+from amers.services.docstrings import attribute_descriptions
+from amers.services.types import Progress
 
 Commit = Callable[[Connection], dict[str, Any]]
 """Writes the outcome of a job in the transaction that ends the job, and returns the job's results."""

@@ -11,20 +11,25 @@ from typing import Any
 
 import numpy as np
 
-from app.errors import InputError
-from app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
-from services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification, Provenance
-from services.formats.block.writer import write_block
-from services.formats.images.bands import parse_bands
-from services.formats.images.scenes import read_scene
-from services.imagery.scene import Scene
-from services.production.from_ortho import (
+from amers.app.errors import InputError
+from amers.app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
+from amers.services.formats.block.document import (
+    AccuracyFigure,
+    BlockMetadata,
+    BlockSpecification,
+    Provenance,
+)
+from amers.services.formats.block.writer import write_block
+from amers.services.formats.images.bands import parse_bands
+from amers.services.formats.images.scenes import read_scene
+from amers.services.imagery.scene import Scene
+from amers.services.production.from_ortho import (
     GroundHeights,
     OrthoPointOptions,
     OrthoPoints,
     produce_ortho_points,
 )
-from services.types import Acquisition, Array, ControlPoints, Progress, no_progress, part_of
+from amers.services.types import Acquisition, Array, ControlPoints, Progress, no_progress, part_of
 
 
 @dataclass(frozen=True)
@@ -56,7 +61,7 @@ class OrthoFiles:
         sigma_m: accuracy of the images on the map, metres; by default that of their sensors.
         frame_sigma_up_m: error that all the heights share, one standard deviation, metres; None when
             unknown.
-        bands: see `services.formats.images.bands.parse_bands`.
+        bands: see `amers.services.formats.images.bands.parse_bands`.
         mask: image of the same ground; points are avoided where it is not zero.
     """
 

@@ -7,13 +7,13 @@ caller records what it reserves: concurrent requests of one token wait for each 
 
 from uuid import UUID
 
-from app.config import Settings
-from app.db import tokens, usage
-from app.db.engine import Connection
-from app.db.jobs import attempts
-from app.db.jobs.jobs import Job
-from app.db.tokens import Token
-from app.errors import TooLarge, TooMany
+from amers.app.config import Settings
+from amers.app.db import tokens, usage
+from amers.app.db.engine import Connection
+from amers.app.db.jobs import attempts
+from amers.app.db.jobs.jobs import Job
+from amers.app.db.tokens import Token
+from amers.app.errors import TooLarge, TooMany
 
 FREE_ROOM = (
     "delete scenes, uploads or jobs that are no longer needed, or ask the administrator for a larger "

@@ -13,16 +13,16 @@ from typing import Literal
 
 import psycopg
 
-from app import reserve
-from app.config import Settings
-from app.db import checks, engine, revisions
-from app.db.engine import Connection
-from app.db.jobs import progress
-from app.errors import StorageOutage
-from app.outages import NO_ANSWER, outage_of
-from app.usecases import storage_identity
-from app.usecases.installation import Installation
-from app.usecases.operations import existing_folder
+from amers.app import reserve
+from amers.app.config import Settings
+from amers.app.db import checks, engine, revisions
+from amers.app.db.engine import Connection
+from amers.app.db.jobs import progress
+from amers.app.errors import StorageOutage
+from amers.app.outages import NO_ANSWER, outage_of
+from amers.app.usecases import storage_identity
+from amers.app.usecases.installation import Installation
+from amers.app.usecases.operations import existing_folder
 
 VALID_S = 2.0
 """A result is repeated for this time, so that frequent probes cost nothing."""

@@ -7,25 +7,25 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from app.config import Settings
-from app.db import references
-from app.db.engine import Connection, Database
-from app.db.references import ReferenceRow
-from app.errors import Conflict, InputError, NotFound
-from app.usecases.registration.reference_source import (
+from amers.app.config import Settings
+from amers.app.db import references
+from amers.app.db.engine import Connection, Database
+from amers.app.db.references import ReferenceRow
+from amers.app.errors import Conflict, InputError, NotFound
+from amers.app.usecases.registration.reference_source import (
     CoveringReference,
     FindReference,
     ReferenceFiles,
     read_reference,
 )
-from app.usecases.server_files import file_below
-from app.usecases.terrain_file import TerrainFile
-from services.geodesy import ecef_from_lon_lat_h
-from services.imagery.scene import Scene, scene_footprint
-from services.matching.reference_image import ReferenceMatchingOptions
-from services.registration.on_points import Registration
-from services.sensors.ortho import OrthoModel
-from services.types import Acquisition, Array, BoolArray
+from amers.app.usecases.server_files import file_below
+from amers.app.usecases.terrain_file import TerrainFile
+from amers.services.geodesy import ecef_from_lon_lat_h
+from amers.services.imagery.scene import Scene, scene_footprint
+from amers.services.matching.reference_image import ReferenceMatchingOptions
+from amers.services.registration.on_points import Registration
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Acquisition, Array, BoolArray
 
 LONGEST_NAME = 120
 

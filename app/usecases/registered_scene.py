@@ -4,15 +4,15 @@ import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from app.errors import InputError
-from services.formats.images.scenes import read_scene
-from services.formats.sensor_models.correction_json import parse_correction_accuracy
-from services.formats.sensor_models.refined_model import CORRECTION_JSON
-from services.formats.text_files import read_text
-from services.imagery.scene import Scene
-from services.quality.correction_accuracy import CorrectionAccuracy
-from services.sensors.correction import CorrectedModel
-from services.sensors.ortho import OrthoModel
+from amers.app.errors import InputError
+from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.sensor_models.correction_json import parse_correction_accuracy
+from amers.services.formats.sensor_models.refined_model import CORRECTION_JSON
+from amers.services.formats.text_files import read_text
+from amers.services.imagery.scene import Scene
+from amers.services.quality.correction_accuracy import CorrectionAccuracy
+from amers.services.sensors.correction import CorrectedModel
+from amers.services.sensors.ortho import OrthoModel
 
 REFINED_NAME = "refined_RPC.TXT"
 """Name of the refined model among the outputs of a registration."""

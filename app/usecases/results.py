@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Any, Literal
 from uuid import UUID
 
-from app.db import stored_files
-from app.db.engine import Database
-from app.db.jobs import attempts, jobs
-from app.db.jobs.jobs import Job
-from app.errors import NotFound, StorageOutage
-from app.storage import Storage
-from app.usecases import quotas
-from app.usecases.damage import named_by_row
-from app.usecases.media_types import media_type
-from app.usecases.processes import Work, results_folder
+from amers.app.db import stored_files
+from amers.app.db.engine import Database
+from amers.app.db.jobs import attempts, jobs
+from amers.app.db.jobs.jobs import Job
+from amers.app.errors import NotFound, StorageOutage
+from amers.app.storage import Storage
+from amers.app.usecases import quotas
+from amers.app.usecases.damage import named_by_row
+from amers.app.usecases.media_types import media_type
+from amers.app.usecases.processes import Work, results_folder
 
 Transmission = Literal["value", "reference"]
 LARGEST_VALUE_BYTES = 16 << 20

@@ -2,14 +2,14 @@
 
 import logging
 
-from app.config import Settings
-from app.db import audit
-from app.db.engine import Database
-from app.db.jobs import jobs
-from app.request_context import Origin, working_for
-from app.storage import Storage
-from app.usecases.processes import results_folder
-from app.usecases.results import delete_files
+from amers.app.config import Settings
+from amers.app.db import audit
+from amers.app.db.engine import Database
+from amers.app.db.jobs import jobs
+from amers.app.request_context import Origin, working_for
+from amers.app.storage import Storage
+from amers.app.usecases.processes import results_folder
+from amers.app.usecases.results import delete_files
 
 DAY_S = 86_400.0
 

@@ -5,14 +5,14 @@ from contextlib import contextmanager
 from typing import Any
 from uuid import UUID
 
-from app.db import registrations, scenes
-from app.db.engine import Connection
-from app.db.scenes import SceneRow
-from app.db.tokens import Token
-from app.errors import Conflict, InputError
-from app.usecases.registered_scene import REFINED_NAME
-from app.usecases.scenes import clean_name, visible_scene
-from services.formats.sensor_models.refined_model import CORRECTION_JSON
+from amers.app.db import registrations, scenes
+from amers.app.db.engine import Connection
+from amers.app.db.scenes import SceneRow
+from amers.app.db.tokens import Token
+from amers.app.errors import Conflict, InputError
+from amers.app.usecases.registered_scene import REFINED_NAME
+from amers.app.usecases.scenes import clean_name, visible_scene
+from amers.services.formats.sensor_models.refined_model import CORRECTION_JSON
 
 
 def check_scene(connection: Connection, caller: Token, scene_id: UUID) -> None:

@@ -8,17 +8,17 @@ from tempfile import TemporaryDirectory
 from typing import Any, Literal, get_args
 from uuid import UUID
 
-from app.auth import Scope
-from app.db.engine import Connection
-from app.db.jobs.jobs import Job
-from app.db.tokens import Token
-from app.errors import DamagedFile, InputError, NotFound
-from app.storage import Storage
-from app.usecases.damage import named_by_row, suspecting_damage
-from app.usecases.processes import Commit, Process, Work
-from app.usecases.registered_scene import SceneModel, read_registered_scene
-from app.usecases.results import result_key, store_results
-from app.usecases.scene_inputs import (
+from amers.app.auth import Scope
+from amers.app.db.engine import Connection
+from amers.app.db.jobs.jobs import Job
+from amers.app.db.tokens import Token
+from amers.app.errors import DamagedFile, InputError, NotFound
+from amers.app.storage import Storage
+from amers.app.usecases.damage import named_by_row, suspecting_damage
+from amers.app.usecases.processes import Commit, Process, Work
+from amers.app.usecases.registered_scene import SceneModel, read_registered_scene
+from amers.app.usecases.results import result_key, store_results
+from amers.app.usecases.scene_inputs import (
     check_file_names,
     check_scene,
     naming,
@@ -26,21 +26,21 @@ from app.usecases.scene_inputs import (
     registered_model_keys,
     registration_files,
 )
-from app.usecases.scenes import local_image, stored_keys
-from app.usecases.terrain_file import TerrainFile, read_terrain
-from services.errors import FormatError
-from services.formats.elevation.geoid import vertical_crs
-from services.formats.gcp.json_formats import parse_geojson_points
-from services.formats.images.map_tiles import read_map_tile, write_map_tiles
-from services.formats.images.raster import RasterImage
-from services.formats.images.tiles import grey_range
-from services.formats.text_files import read_text
-from services.imagery.scene import Scene, scene_footprint
-from services.orthorectification.point_terrain import terrain_of_points
-from services.orthorectification.rectify import OrthoOptions, orthorectify
-from services.orthorectification.tile_limits import TILE_PX, TileLimits, TilePlace, choose_tiles
-from services.terrain import Terrain
-from services.types import Progress, no_progress
+from amers.app.usecases.scenes import local_image, stored_keys
+from amers.app.usecases.terrain_file import TerrainFile, read_terrain
+from amers.services.errors import FormatError
+from amers.services.formats.elevation.geoid import vertical_crs
+from amers.services.formats.gcp.json_formats import parse_geojson_points
+from amers.services.formats.images.map_tiles import read_map_tile, write_map_tiles
+from amers.services.formats.images.raster import RasterImage
+from amers.services.formats.images.tiles import grey_range
+from amers.services.formats.text_files import read_text
+from amers.services.imagery.scene import Scene, scene_footprint
+from amers.services.orthorectification.point_terrain import terrain_of_points
+from amers.services.orthorectification.rectify import OrthoOptions, orthorectify
+from amers.services.orthorectification.tile_limits import TILE_PX, TileLimits, TilePlace, choose_tiles
+from amers.services.terrain import Terrain
+from amers.services.types import Progress, no_progress
 
 Layer = Literal["raw", "registered"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)

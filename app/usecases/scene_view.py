@@ -6,16 +6,16 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from uuid import UUID
 
-from app.auth import Scope
-from app.db.engine import Connection
-from app.db.tokens import Token
-from app.usecases.damage import suspecting_damage
-from app.usecases.processes import Commit, Process, Work
-from app.usecases.results import store_results
-from app.usecases.scene_inputs import check_scene, present_scene
-from app.usecases.scenes import local_image, stored_keys
-from services.formats.images.raster import open_raster
-from services.formats.images.tiles import TileIndex, format_tile_index, write_tiles
+from amers.app.auth import Scope
+from amers.app.db.engine import Connection
+from amers.app.db.tokens import Token
+from amers.app.usecases.damage import suspecting_damage
+from amers.app.usecases.processes import Commit, Process, Work
+from amers.app.usecases.results import store_results
+from amers.app.usecases.scene_inputs import check_scene, present_scene
+from amers.app.usecases.scenes import local_image, stored_keys
+from amers.services.formats.images.raster import open_raster
+from amers.services.formats.images.tiles import TileIndex, format_tile_index, write_tiles
 
 INDEX_NAME, TILES_NAME = "tiles.json", "tiles.bin"
 

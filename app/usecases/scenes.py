@@ -9,22 +9,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from uuid import UUID
 
-from app.auth import may_access, owner_filter
-from app.config import Settings
-from app.db import scenes, uploads
-from app.db.engine import Connection
-from app.db.scene_registrations import SceneRegistration, last_registrations
-from app.db.scenes import SceneRow
-from app.db.tokens import Token
-from app.db.uploads import AnnouncedFile
-from app.errors import Conflict, InputError, NotFound, StorageOutage, TooLarge, TooMany
-from app.storage import Storage, StoredFile, Writing
-from app.usecases import quotas
-from app.usecases.damage import named_by_row
-from app.usecases.installation import Installation
-from app.usecases.server_files import file_below
-from services.errors import FormatError
-from services.formats.images.signatures import DRIVER_OF_SIGNATURE
+from amers.app.auth import may_access, owner_filter
+from amers.app.config import Settings
+from amers.app.db import scenes, uploads
+from amers.app.db.engine import Connection
+from amers.app.db.scene_registrations import SceneRegistration, last_registrations
+from amers.app.db.scenes import SceneRow
+from amers.app.db.tokens import Token
+from amers.app.db.uploads import AnnouncedFile
+from amers.app.errors import Conflict, InputError, NotFound, StorageOutage, TooLarge, TooMany
+from amers.app.storage import Storage, StoredFile, Writing
+from amers.app.usecases import quotas
+from amers.app.usecases.damage import named_by_row
+from amers.app.usecases.installation import Installation
+from amers.app.usecases.server_files import file_below
+from amers.services.errors import FormatError
+from amers.services.formats.images.signatures import DRIVER_OF_SIGNATURE
 
 LONGEST_NAME = 120
 LONGEST_SIGNATURE = max(len(signature) for signature in DRIVER_OF_SIGNATURE)

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from app.errors import InputError
+from amers.app.errors import InputError
 
 
 def file_below(folder: Path, path: str, field: str, setting: str) -> Path:

@@ -12,15 +12,15 @@ from functools import partial
 
 import psycopg
 
-from app.config import Settings
-from app.db import installation, uploads
-from app.db.engine import Connection, Database
-from app.db.installation import InstallationRow
-from app.errors import Conflict, InputError, NotFound, StorageOutage
-from app.outages import outage_of
-from app.storage import Marker, Storage, open_storage, read_marker, write_marker
-from app.usecases import garbage_collection
-from app.usecases.uploads import arriving_files
+from amers.app.config import Settings
+from amers.app.db import installation, uploads
+from amers.app.db.engine import Connection, Database
+from amers.app.db.installation import InstallationRow
+from amers.app.errors import Conflict, InputError, NotFound, StorageOutage
+from amers.app.outages import outage_of
+from amers.app.storage import Marker, Storage, open_storage, read_marker, write_marker
+from amers.app.usecases import garbage_collection
+from amers.app.usecases.uploads import arriving_files
 
 log = logging.getLogger(__name__)
 

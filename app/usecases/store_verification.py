@@ -12,18 +12,18 @@ from uuid import UUID
 
 import numpy as np
 
-from app.config import Settings
-from app.db import blocks, references, stored_files
-from app.db.engine import Database
-from app.db.stored_files import NamedFile
-from app.errors import NotFound
-from app.storage import Storage, trash
-from app.storage.chips import damage_of_rows
-from app.storage.content import READ_BYTES, Content, read_content
-from app.usecases import garbage_collection
-from app.usecases.installation import Installation
-from services.formats.chips.checksums import CHECKSUM
-from services.types import Progress
+from amers.app.config import Settings
+from amers.app.db import blocks, references, stored_files
+from amers.app.db.engine import Database
+from amers.app.db.stored_files import NamedFile
+from amers.app.errors import NotFound
+from amers.app.storage import Storage, trash
+from amers.app.storage.chips import damage_of_rows
+from amers.app.storage.content import READ_BYTES, Content, read_content
+from amers.app.usecases import garbage_collection
+from amers.app.usecases.installation import Installation
+from amers.services.formats.chips.checksums import CHECKSUM
+from amers.services.types import Progress
 
 POINTS_NAMED = 10
 MEGABYTE = 1e6

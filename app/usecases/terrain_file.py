@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from services.errors import MissingGeoid
-from services.formats.elevation.dem import read_dem
-from services.terrain import Terrain
+from amers.services.errors import MissingGeoid
+from amers.services.formats.elevation.dem import read_dem
+from amers.services.terrain import Terrain
 
 HEIGHT_SIGMA_POSTINGS = 0.1
 """Assumed standard deviation of heights between the nodes of a terrain, in distances of its nodes."""

@@ -3,11 +3,11 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from app.auth import Scope, new_secret, secret_hash
-from app.db import tokens
-from app.db.engine import Connection
-from app.db.tokens import Token
-from app.errors import Conflict, InputError, NotFound
+from amers.app.auth import Scope, new_secret, secret_hash
+from amers.app.db import tokens
+from amers.app.db.engine import Connection
+from amers.app.db.tokens import Token
+from amers.app.errors import Conflict, InputError, NotFound
 
 LONGEST_DAYS = 36_500
 LONGEST_NAME = 200

@@ -10,19 +10,19 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 from uuid import UUID
 
-from app.auth import Scope, may_access, require
-from app.config import Settings
-from app.db import scenes, uploads
-from app.db.engine import Connection, Database
-from app.db.schema import UploadPurpose
-from app.db.tokens import Token
-from app.db.uploads import AnnouncedFile, UploadRow
-from app.errors import AmersError, Conflict, InputError, NotFound, TooLarge
-from app.storage import Storage
-from app.usecases import quotas
-from app.usecases.blocks.uploads import block_key
-from app.usecases.installation import Installation
-from app.usecases.scenes import (
+from amers.app.auth import Scope, may_access, require
+from amers.app.config import Settings
+from amers.app.db import scenes, uploads
+from amers.app.db.engine import Connection, Database
+from amers.app.db.schema import UploadPurpose
+from amers.app.db.tokens import Token
+from amers.app.db.uploads import AnnouncedFile, UploadRow
+from amers.app.errors import AmersError, Conflict, InputError, NotFound, TooLarge
+from amers.app.storage import Storage
+from amers.app.usecases import quotas
+from amers.app.usecases.blocks.uploads import block_key
+from amers.app.usecases.installation import Installation
+from amers.app.usecases.scenes import (
     MODEL_SUFFIXES,
     SIDE_FILE_LIMIT_BYTES,
     clean_name,
@@ -33,7 +33,7 @@ from app.usecases.scenes import (
     side_file_name,
     visible_scene,
 )
-from services.formats.archives import (
+from amers.services.formats.archives import (
     HEAD_BYTES,
     ArchiveLimits,
     check_archive,

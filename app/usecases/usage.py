@@ -3,15 +3,15 @@
 from dataclasses import dataclass
 from uuid import UUID
 
-from app.config import Settings
-from app.db import tokens, usage
-from app.db.engine import Connection
-from app.db.tokens import Token
-from app.db.usage import Usage
-from app.storage import Storage
-from app.storage.trash import TRASH
-from app.usecases import garbage_collection
-from app.usecases.quotas import storage_quota
+from amers.app.config import Settings
+from amers.app.db import tokens, usage
+from amers.app.db.engine import Connection
+from amers.app.db.tokens import Token
+from amers.app.db.usage import Usage
+from amers.app.storage import Storage
+from amers.app.storage.trash import TRASH
+from amers.app.usecases import garbage_collection
+from amers.app.usecases.quotas import storage_quota
 
 COMMAND_LINE = "the command line"
 

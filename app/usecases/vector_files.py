@@ -10,13 +10,13 @@ import numpy.typing as npt
 import pyarrow as pa
 import shapely
 
-from app.errors import InputError
-from services.formats.vector.layers import VectorLayer, driver_of, write_layer
-from services.formats.vector.pixel_coordinates import PixelOrigin
-from services.imagery.scene import Scene, scene_centre, scene_footprint
-from services.map_grid import utm_of
-from services.types import Array, BoolArray, IntArray
-from services.vectors.shapes import Shapes
+from amers.app.errors import InputError
+from amers.services.formats.vector.layers import VectorLayer, driver_of, write_layer
+from amers.services.formats.vector.pixel_coordinates import PixelOrigin
+from amers.services.imagery.scene import Scene, scene_centre, scene_footprint
+from amers.services.map_grid import utm_of
+from amers.services.types import Array, BoolArray, IntArray
+from amers.services.vectors.shapes import Shapes
 
 Column = npt.NDArray[Any]
 

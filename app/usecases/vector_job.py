@@ -8,34 +8,34 @@ from tempfile import TemporaryDirectory
 from typing import Any, Literal, get_args
 from uuid import UUID
 
-from app.auth import Scope
-from app.db.engine import Connection
-from app.db.tokens import Token
-from app.errors import InputError
-from app.usecases.damage import named_by_row, suspecting_damage
-from app.usecases.processes import Commit, Process, Work
-from app.usecases.registered_scene import SceneModel
-from app.usecases.results import store_results
-from app.usecases.scene_inputs import (
+from amers.app.auth import Scope
+from amers.app.db.engine import Connection
+from amers.app.db.tokens import Token
+from amers.app.errors import InputError
+from amers.app.usecases.damage import named_by_row, suspecting_damage
+from amers.app.usecases.processes import Commit, Process, Work
+from amers.app.usecases.registered_scene import SceneModel
+from amers.app.usecases.results import store_results
+from amers.app.usecases.scene_inputs import (
     check_file_names,
     check_scene,
     naming,
     present_scene,
     registered_model_keys,
 )
-from app.usecases.scenes import local_image, stored_keys
-from app.usecases.terrain_file import TerrainFile
-from app.usecases.vector_files import (
+from amers.app.usecases.scenes import local_image, stored_keys
+from amers.app.usecases.terrain_file import TerrainFile
+from amers.app.usecases.vector_files import (
     CorrectionOptions,
     ProjectionOptions,
     VectorFile,
     VectorOptions,
     check_options,
 )
-from app.usecases.vectors import correct_file, project_file
-from services.formats.elevation.geoid import vertical_crs
-from services.map_grid import check_map_code
-from services.quality.accuracy_statement import AccuracyStatement, accuracy_document
+from amers.app.usecases.vectors import correct_file, project_file
+from amers.services.formats.elevation.geoid import vertical_crs
+from amers.services.map_grid import check_map_code
+from amers.services.quality.accuracy_statement import AccuracyStatement, accuracy_document
 
 Format = Literal["gpkg", "geojson"]
 SUFFIXES = (".geojson", ".json")

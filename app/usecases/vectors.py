@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from app.errors import InputError
-from app.usecases.registered_scene import SceneModel, read_raw_scene
-from app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
-from app.usecases.vector_files import (
+from amers.app.errors import InputError
+from amers.app.usecases.registered_scene import SceneModel, read_raw_scene
+from amers.app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
+from amers.app.usecases.vector_files import (
     CorrectionOptions,
     ProjectionOptions,
     VectorFile,
@@ -20,19 +20,25 @@ from app.usecases.vector_files import (
     refuse_overwriting,
     write_vertices,
 )
-from services.formats.vector.layers import read_layer, write_layer
-from services.formats.vector.pixel_coordinates import (
+from amers.services.formats.vector.layers import read_layer, write_layer
+from amers.services.formats.vector.pixel_coordinates import (
     PixelOrigin,
     check_inside,
     line_sample_of_xy,
     xy_of_line_sample,
 )
-from services.map_grid import check_map, check_map_code
-from services.quality.accuracy_statement import StatedAccuracy, vertices_accuracy
-from services.vectors.accuracy import ErrorSources
-from services.vectors.correct import correct_vectors, has_heights, missed_place
-from services.vectors.project import cut, ground_outline, hidden_share, image_outline, project_vectors
-from services.vectors.shapes import geometries_of, shapes_of
+from amers.services.map_grid import check_map, check_map_code
+from amers.services.quality.accuracy_statement import StatedAccuracy, vertices_accuracy
+from amers.services.vectors.accuracy import ErrorSources
+from amers.services.vectors.correct import correct_vectors, has_heights, missed_place
+from amers.services.vectors.project import (
+    cut,
+    ground_outline,
+    hidden_share,
+    image_outline,
+    project_vectors,
+)
+from amers.services.vectors.shapes import geometries_of, shapes_of
 
 RELATIVE_CE90, ON_THE_EARTH_CE90, HIDDEN = "ce90_m", "ce90_earth", "hidden"
 """Attributes that features get: the largest CE90 of their vertices, metres; share of hidden vertices."""

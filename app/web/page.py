@@ -12,11 +12,11 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import RedirectResponse
 from pydantic import BaseModel
 
-from app.api.conditions import tag_of
-from app.api.paths import SLASH
-from app.api.routes import CallerRoute
-from app.config import Settings
-from app.errors import NotFound
+from amers.app.api.conditions import tag_of
+from amers.app.api.paths import SLASH
+from amers.app.api.routes import CallerRoute
+from amers.app.config import Settings
+from amers.app.errors import NotFound
 
 router = APIRouter(include_in_schema=False, route_class=CallerRoute)
 

@@ -15,18 +15,18 @@ from typing import Any
 
 import psycopg
 
-from app.config import Settings
-from app.db import revisions
-from app.db.engine import Database, driver
-from app.db.jobs import attempts
-from app.db.jobs.attempts import LostJob
-from app.db.jobs.jobs import Job
-from app.errors import StorageOutage, is_no_room
-from app.outages import outage_of
-from app.request_context import Origin, working_for
-from app.storage import Storage
-from app.usecases import results, storage_identity
-from app.worker.warm_process import WarmProcess, WarmServer
+from amers.app.config import Settings
+from amers.app.db import revisions
+from amers.app.db.engine import Database, driver
+from amers.app.db.jobs import attempts
+from amers.app.db.jobs.attempts import LostJob
+from amers.app.db.jobs.jobs import Job
+from amers.app.errors import StorageOutage, is_no_room
+from amers.app.outages import outage_of
+from amers.app.request_context import Origin, working_for
+from amers.app.storage import Storage
+from amers.app.usecases import results, storage_identity
+from amers.app.worker.warm_process import WarmProcess, WarmServer
 
 FAILURES_ALLOWED = 3
 """A job fails when this many attempts at it have ended without an outcome."""
@@ -207,7 +207,7 @@ class Attempts:
         arguments = (job.id, job.attempt, os.getpid(), self.settings.job_memory_bytes)
         with self._storage.scratch_folder(f"job-{job.id}-") as folder:
             process = self.processes.start(
-                "app.worker.run:main", [str(value) for value in arguments], {"TMPDIR": str(folder)}
+                "amers.app.worker.run:main", [str(value) for value in arguments], {"TMPDIR": str(folder)}
             )
             try:
                 return self._watch(job, process)

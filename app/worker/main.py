@@ -14,16 +14,16 @@ from dataclasses import dataclass, field
 import procrastinate
 import psycopg
 
-from app.config import Settings
-from app.db import engine, session
-from app.db.engine import Database
-from app.db.jobs import queue
-from app.outages import NO_ANSWER, outage_of
-from app.storage import Storage, open_storage
-from app.usecases import storage_identity
-from app.worker.attempt import Attempts
-from app.worker.sweep import Sweeper
-from app.worker.warm_process import WarmServer
+from amers.app.config import Settings
+from amers.app.db import engine, session
+from amers.app.db.engine import Database
+from amers.app.db.jobs import queue
+from amers.app.outages import NO_ANSWER, outage_of
+from amers.app.storage import Storage, open_storage
+from amers.app.usecases import storage_identity
+from amers.app.worker.attempt import Attempts
+from amers.app.worker.sweep import Sweeper
+from amers.app.worker.warm_process import WarmServer
 
 ENDING = (signal.SIGTERM, signal.SIGINT)
 LONGEST_POLL_S = 5.0

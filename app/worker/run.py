@@ -10,15 +10,15 @@ file.
 import logging
 from uuid import UUID
 
-from app import logs
-from app.config import read_settings
-from app.db.engine import pooled
-from app.db.jobs.attempts import LostJob
-from app.errors import StorageOutage, is_no_memory, is_no_room
-from app.request_context import Origin, working_for
-from app.usecases.jobs import do_attempt
-from app.worker.attempt import NO_ROOM, OUT_OF_MEMORY, STORAGE_AWAY
-from app.worker.warm_server import limit_files, limit_memory
+from amers.app import logs
+from amers.app.config import read_settings
+from amers.app.db.engine import pooled
+from amers.app.db.jobs.attempts import LostJob
+from amers.app.errors import StorageOutage, is_no_memory, is_no_room
+from amers.app.request_context import Origin, working_for
+from amers.app.usecases.jobs import do_attempt
+from amers.app.worker.attempt import NO_ROOM, OUT_OF_MEMORY, STORAGE_AWAY
+from amers.app.worker.warm_server import limit_files, limit_memory
 
 log = logging.getLogger(__name__)
 

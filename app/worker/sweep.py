@@ -10,19 +10,19 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass
 
-from app import reserve
-from app.config import TRASH_DAYS, Settings
-from app.db import scenes, uptime
-from app.db.engine import Database, limit_lock_wait
-from app.db.jobs import attempts, queue
-from app.errors import StorageOutage
-from app.outages import outage_of
-from app.storage import Storage, trash
-from app.usecases import garbage_collection, results, retention, storage_identity
-from app.usecases.blocks.uploads import remove_expired_archives
-from app.usecases.garbage_collection import Bin, remove_unnamed_chips, remove_unnamed_files
-from app.usecases.uploads import UPLOAD_PREFIX, remove_abandoned_uploads
-from app.worker.attempt import ATTEMPTS_ALLOWED
+from amers.app import reserve
+from amers.app.config import TRASH_DAYS, Settings
+from amers.app.db import scenes, uptime
+from amers.app.db.engine import Database, limit_lock_wait
+from amers.app.db.jobs import attempts, queue
+from amers.app.errors import StorageOutage
+from amers.app.outages import outage_of
+from amers.app.storage import Storage, trash
+from amers.app.usecases import garbage_collection, results, retention, storage_identity
+from amers.app.usecases.blocks.uploads import remove_expired_archives
+from amers.app.usecases.garbage_collection import Bin, remove_unnamed_chips, remove_unnamed_files
+from amers.app.usecases.uploads import UPLOAD_PREFIX, remove_abandoned_uploads
+from amers.app.worker.attempt import ATTEMPTS_ALLOWED
 
 SILENT_WORKER_S = 60.0
 """A worker of the queue sends a heartbeat every ten seconds; without one for this long it is dead."""

@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from types import TracebackType
 
-from app.child_processes import SAFE_PATH, python_command
-from app.one_thread import ONE_THREAD
+from amers.app.child_processes import SAFE_PATH, python_command
+from amers.app.one_thread import ONE_THREAD
 
 LIMITED_LIBRARIES = {
     **ONE_THREAD,
@@ -81,7 +81,7 @@ class WarmProcess:
 
 
 class WarmServer:
-    """Starts processes of `app.worker.warm_server`, which it starts and, when it has died, restarts.
+    """Starts processes of `amers.app.worker.warm_server`, which it restarts when it has died.
 
     The server ends with this process, however it ends, and its processes end with the server.
     """
@@ -151,7 +151,7 @@ class WarmServer:
             self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             with theirs:
                 self._process = subprocess.Popen(
-                    python_command("-m", "app.worker.warm_server", str(theirs.fileno())),
+                    python_command("-m", "amers.app.worker.warm_server", str(theirs.fileno())),
                     env=self._environment,
                     stdin=subprocess.DEVNULL,
                     pass_fds=[theirs.fileno()],

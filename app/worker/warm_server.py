@@ -1,10 +1,10 @@
 """A process that has loaded all modules and compiled code, and forks the processes that do the work.
 
-Started as `python -m app.worker.warm_server SOCKET`, with the descriptor of a socket to its parent. Each
-message of this socket asks for one process: a JSON document with its function and arguments, and the
-descriptor of a connection of its own. Over this connection the server sends the number of the process,
-and later its exit code and the CPU that it took with its children, seconds. When the parent closes its
-side, the process is killed with all it started.
+Started as `python -m amers.app.worker.warm_server SOCKET`, with the descriptor of a socket to its
+parent. Each message of this socket asks for one process: a JSON document with its function and
+arguments, and the descriptor of a connection of its own. Over this connection the server sends the
+number of the process, and later its exit code and the CPU that it took with its children, seconds. When
+the parent closes its side, the process is killed with all it started.
 """
 
 import ctypes
@@ -60,7 +60,7 @@ def main(arguments: list[str]) -> int:
 
     Returns the exit code of the server, or that of a forked process.
     """
-    from app.worker.warm_up import warm_up
+    from amers.app.worker.warm_up import warm_up
 
     (descriptor,) = arguments
     control = socket.socket(fileno=int(descriptor))

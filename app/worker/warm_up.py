@@ -4,16 +4,16 @@ import cv2
 import numpy as np
 import pyogrio  # noqa: F401 - imports pandas where it is installed
 
-import app.worker.run  # noqa: F401 - imports what the processes of jobs need
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, render_chip
-from services.matching.multi_image import stored_chip
-from services.registration.on_points import register_scene
-from services.reports.html import page_template
-from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
-from services.sensors.refined import refined_rpc
-from services.sensors.rpc import RpcModel, check_rpc
-from services.types import UNKNOWN_FRAME, Acquisition, ChipArray, ControlPoints, Views
+import amers.app.worker.run  # noqa: F401 - imports what the processes of jobs need
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, render_chip
+from amers.services.matching.multi_image import stored_chip
+from amers.services.registration.on_points import register_scene
+from amers.services.reports.html import page_template
+from amers.services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
+from amers.services.sensors.refined import refined_rpc
+from amers.services.sensors.rpc import RpcModel, check_rpc
+from amers.services.types import UNKNOWN_FRAME, Acquisition, ChipArray, ControlPoints, Views
 
 _SIZE = 520
 _GSD_DEG = 1e-5

@@ -1,9 +1,9 @@
 """The store: tables, indexes, functions, triggers and the rows that every store has.
 
-The script beside this file was written by `python -m app.db.ddl` from `app/db/schema` and `app/db/sql`.
-It is a copy, because a migration must do the same thing for ever while the schema goes on to change:
-later changes are revisions of their own. `tests/app/test_schema.py` compares the result of all
-revisions with the schema, completely.
+The script beside this file was written by `python -m amers.app.db.ddl` from `app/db/schema` and
+`app/db/sql`. It is a copy, because a migration must do the same thing for ever while the schema goes on
+to change: later changes are revisions of their own. `tests/app/test_schema.py` compares the result of
+all revisions with the schema, completely.
 """
 
 from pathlib import Path

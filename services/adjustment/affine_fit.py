@@ -6,9 +6,9 @@ from typing import Literal
 
 import numpy as np
 
-from services.adjustment.robust import MAD_TO_STD, ROUNDING, likeliest_variance
-from services.adjustment.robust_kernel import reweighted_solution
-from services.types import Array, BoolArray
+from amers.services.adjustment.robust import MAD_TO_STD, ROUNDING, likeliest_variance
+from amers.services.adjustment.robust_kernel import reweighted_solution
+from amers.services.types import Array, BoolArray
 
 Order = Literal["shift", "drift", "affine"]
 ORDERS: tuple[Order, ...] = ("shift", "drift", "affine")

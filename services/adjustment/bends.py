@@ -11,11 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from services.adjustment.displacement_components import Along, Component, Kind
-from services.adjustment.displacement_solution import by_affine, padded
-from services.adjustment.structure import Residuals
-from services.sensors.correction import no_correction
-from services.types import Array
+from amers.services.adjustment.displacement_components import Along, Component, Kind
+from amers.services.adjustment.displacement_solution import by_affine, padded
+from amers.services.adjustment.structure import Residuals
+from amers.services.sensors.correction import no_correction
+from amers.services.types import Array
 
 _EXPECTED_PX = 1.0
 """Standard deviation of the coefficient of a bent image, unless points clearly show a larger one."""

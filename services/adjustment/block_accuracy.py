@@ -5,18 +5,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.adjustment.block_gauge import Gauge
-from services.adjustment.known_images import Tie
-from services.adjustment.normal_equations import Equations, Pairs, Points, shared_covariance
-from services.adjustment.parameters import (
+from amers.services.adjustment.block_gauge import Gauge
+from amers.services.adjustment.known_images import Tie
+from amers.services.adjustment.normal_equations import Equations, Pairs, Points, shared_covariance
+from amers.services.adjustment.parameters import (
     PASS_SHARE,
     AdjustableImage,
     BlockPriors,
     sharing_covariance,
     shift_rows,
 )
-from services.adjustment.reduced_system import ReducedSystem
-from services.types import Array, BoolArray, Frame, IntArray
+from amers.services.adjustment.reduced_system import ReducedSystem
+from amers.services.types import Array, BoolArray, Frame, IntArray
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from numba import njit
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from services.adjustment.normal_equations import Equations, common_pairs
-from services.geodesy import continuous
-from services.types import Array, BoolArray, IntArray
+from amers.services.adjustment.normal_equations import Equations, common_pairs
+from amers.services.geodesy import continuous
+from amers.services.types import Array, BoolArray, IntArray
 
 MIN_COMMON = 3
 """Number of points in common that ties two images: as many as a translation has coordinates."""

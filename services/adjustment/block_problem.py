@@ -6,13 +6,13 @@ from functools import cached_property
 
 import numpy as np
 
-from services.adjustment.control_ground import ControlGround
-from services.adjustment.known_images import Tie
-from services.adjustment.normal_equations import Equations, Pairs, seen_pairs
-from services.adjustment.parameters import AdjustableImage
-from services.geodesy import metres_per_degree_at, wrapped_degrees
-from services.sensors.ortho import OrthoModel
-from services.types import Array, BoolArray, IntArray, Observations
+from amers.services.adjustment.control_ground import ControlGround
+from amers.services.adjustment.known_images import Tie
+from amers.services.adjustment.normal_equations import Equations, Pairs, seen_pairs
+from amers.services.adjustment.parameters import AdjustableImage
+from amers.services.geodesy import metres_per_degree_at, wrapped_degrees
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Array, BoolArray, IntArray, Observations
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.special import chdtr, chdtri
 
-from services.errors import NoConsensus
-from services.types import Array, BoolArray, IntArray
+from amers.services.errors import NoConsensus
+from amers.services.types import Array, BoolArray, IntArray
 
 MAX_SCALE = 5.0
 """Residuals so many times as large as stated are not those of the observations that were stated."""

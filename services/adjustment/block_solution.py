@@ -4,14 +4,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.block_gauge import MIN_COMMON, Gauge, block_gauge, connected_groups
-from services.adjustment.block_problem import BlockProblem
-from services.adjustment.normal_equations import Equations, Points, eliminated, moved_points, reduced
-from services.adjustment.parameters import BlockPriors
-from services.adjustment.reduced_system import ReducedSystem, reduced_system
-from services.errors import DisconnectedBlock, NoConvergence
-from services.geodesy import move_metres
-from services.types import Array
+from amers.services.adjustment.block_gauge import MIN_COMMON, Gauge, block_gauge, connected_groups
+from amers.services.adjustment.block_problem import BlockProblem
+from amers.services.adjustment.normal_equations import (
+    Equations,
+    Points,
+    eliminated,
+    moved_points,
+    reduced,
+)
+from amers.services.adjustment.parameters import BlockPriors
+from amers.services.adjustment.reduced_system import ReducedSystem, reduced_system
+from amers.services.errors import DisconnectedBlock, NoConvergence
+from amers.services.geodesy import move_metres
+from amers.services.types import Array
 
 _FARTHEST_M = 2000.0
 """Longest step of a point: rays that are nearly parallel promise more."""

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from services.adjustment.displacement_components import Component
-from services.sensors.correction import ImageCorrection
-from services.types import Array, BoolArray, IntArray
+from amers.services.adjustment.displacement_components import Component
+from amers.services.sensors.correction import ImageCorrection
+from amers.services.types import Array, BoolArray, IntArray
 
 FEWEST_IN_PART = 3
 """Points that agree in a part of an image, below which nothing says where the part lies."""

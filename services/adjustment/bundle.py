@@ -5,29 +5,29 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.block_accuracy import (
+from amers.services.adjustment.block_accuracy import (
     BlockAccuracy,
     block_accuracy,
     carried_covariances,
     earth_frames,
     joint_relative,
 )
-from services.adjustment.block_problem import BlockOptions, BlockProblem
-from services.adjustment.block_scale import LEAST_SCALE, check_scale, posterior_scale
-from services.adjustment.block_solution import checked_gauge, least_squares
-from services.adjustment.control_check import (
+from amers.services.adjustment.block_problem import BlockOptions, BlockProblem
+from amers.services.adjustment.block_scale import LEAST_SCALE, check_scale, posterior_scale
+from amers.services.adjustment.block_solution import checked_gauge, least_squares
+from amers.services.adjustment.control_check import (
     agreeing_control,
     check_place_of_control,
     ray_coordinates,
 )
-from services.adjustment.control_ground import NO_CONTROL, ControlGround
-from services.adjustment.known_images import KnownImages, known_images, tie
-from services.adjustment.parameters import AdjustableImage, BlockPriors, block_priors
-from services.adjustment.reduced_system import DENSE_ROWS, ReducedSystem
-from services.adjustment.robust_start import active_observations, robust_start, started
-from services.errors import InputError, NoConsensus
-from services.sensors.base import SensorModel
-from services.types import Array, BoolArray, Frame, IntArray, Observations
+from amers.services.adjustment.control_ground import NO_CONTROL, ControlGround
+from amers.services.adjustment.known_images import KnownImages, known_images, tie
+from amers.services.adjustment.parameters import AdjustableImage, BlockPriors, block_priors
+from amers.services.adjustment.reduced_system import DENSE_ROWS, ReducedSystem
+from amers.services.adjustment.robust_start import active_observations, robust_start, started
+from amers.services.errors import InputError, NoConsensus
+from amers.services.sensors.base import SensorModel
+from amers.services.types import Array, BoolArray, Frame, IntArray, Observations
 
 
 @dataclass(frozen=True)

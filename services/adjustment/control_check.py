@@ -4,13 +4,13 @@ import numpy as np
 from numba import njit
 from scipy.special import chdtri
 
-from services.adjustment.block_accuracy import BlockAccuracy
-from services.adjustment.block_problem import BlockProblem
-from services.adjustment.block_solution import State
-from services.adjustment.normal_equations import Equations, Pairs, Points, eliminated, pair_row
-from services.adjustment.robust import CAUCHY_TUNING
-from services.errors import InputError
-from services.types import Array, BoolArray, IntArray
+from amers.services.adjustment.block_accuracy import BlockAccuracy
+from amers.services.adjustment.block_problem import BlockProblem
+from amers.services.adjustment.block_solution import State
+from amers.services.adjustment.normal_equations import Equations, Pairs, Points, eliminated, pair_row
+from amers.services.adjustment.robust import CAUCHY_TUNING
+from amers.services.errors import InputError
+from amers.services.types import Array, BoolArray, IntArray
 
 _AGREES = 0.9999
 """Probability with which a control point as good as stated stays."""

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from services.types import Array, BoolArray, Frame, IntArray
+from amers.services.types import Array, BoolArray, Frame, IntArray
 
 
 @dataclass(frozen=True)

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.adjustment.affine_fit import AffineFit
-from services.adjustment.broken_image import MOST_BEYOND, on_one_side
-from services.adjustment.short_motion import ChipStrips
-from services.sensors.base import SensorModel
-from services.sensors.correction import no_correction
-from services.types import Array, BoolArray, IntArray
+from amers.services.adjustment.affine_fit import AffineFit
+from amers.services.adjustment.broken_image import MOST_BEYOND, on_one_side
+from amers.services.adjustment.short_motion import ChipStrips
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.correction import no_correction
+from amers.services.types import Array, BoolArray, IntArray
 
 _LOOSE_PX = 1000.0
 """A priori standard deviation of the offset of a block before anything is known of it."""

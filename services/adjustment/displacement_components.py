@@ -20,8 +20,8 @@ from scipy.linalg.lapack import dpstrf
 from scipy.spatial.distance import cdist
 from scipy.special import eval_legendre
 
-from services.adjustment.structure import ALONG_AXES, Family, Residuals, Structure, structures
-from services.types import Array, IntArray
+from amers.services.adjustment.structure import ALONG_AXES, Family, Residuals, Structure, structures
+from amers.services.types import Array, IntArray
 
 Along = Literal["lines", "samples", "swath", "image"]
 """Of which a displacement is a function: of the line; of the sample; of the line, in proportion to the

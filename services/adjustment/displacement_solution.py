@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.adjustment.displacement_components import Along, Component, with_components
-from services.adjustment.structure import Residuals
-from services.sensors.correction import ImageCorrection, no_correction
-from services.sensors.displacement import DisplacementGrid
-from services.types import Array, BoolArray
+from amers.services.adjustment.displacement_components import Along, Component, with_components
+from amers.services.adjustment.structure import Residuals
+from amers.services.sensors.correction import ImageCorrection, no_correction
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.types import Array, BoolArray
 
 _MEDIAN_OF_LARGER = 1.0512
 """Median of the larger of two magnitudes of the standard normal law."""

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
-from services.adjustment.control_ground import ControlGround
-from services.adjustment.parameters import frame_weight
-from services.adjustment.robust import CAUCHY_TUNING
-from services.errors import NoConsensus
-from services.geodesy import metres_per_degree_at
-from services.types import Array, BoolArray, Frame
+from amers.services.adjustment.control_ground import ControlGround
+from amers.services.adjustment.parameters import frame_weight
+from amers.services.adjustment.robust import CAUCHY_TUNING
+from amers.services.errors import NoConsensus
+from amers.services.geodesy import metres_per_degree_at
+from amers.services.types import Array, BoolArray, Frame
 
 _AGREES = 0.9999
 """Probability of a smaller misfit of known ground that is right."""

@@ -6,29 +6,33 @@ from functools import partial
 
 import numpy as np
 
-from services.adjustment.affine_fit import FREE, ORDERS, AffineFit, Order
-from services.adjustment.broken_image import held_parts, on_one_side, part_of_line
-from services.adjustment.control_observations import ControlObservations, declared_fit, frame_sigma_px
-from services.adjustment.displacement_components import Component
-from services.adjustment.displacement_solution import solve_displacement
-from services.adjustment.moved_ground import MovedGround, moved_ground
-from services.adjustment.order_selection import choose_order
-from services.adjustment.placed_measures import PlacedMeasures
-from services.adjustment.robust import deactivate
-from services.adjustment.scene_motion import SceneMotion, what_moves
-from services.adjustment.scene_solution import AgreeingMeasures
-from services.adjustment.shared_errors import (
+from amers.services.adjustment.affine_fit import FREE, ORDERS, AffineFit, Order
+from amers.services.adjustment.broken_image import held_parts, on_one_side, part_of_line
+from amers.services.adjustment.control_observations import (
+    ControlObservations,
+    declared_fit,
+    frame_sigma_px,
+)
+from amers.services.adjustment.displacement_components import Component
+from amers.services.adjustment.displacement_solution import solve_displacement
+from amers.services.adjustment.moved_ground import MovedGround, moved_ground
+from amers.services.adjustment.order_selection import choose_order
+from amers.services.adjustment.placed_measures import PlacedMeasures
+from amers.services.adjustment.robust import deactivate
+from amers.services.adjustment.scene_motion import SceneMotion, what_moves
+from amers.services.adjustment.scene_solution import AgreeingMeasures
+from amers.services.adjustment.shared_errors import (
     SharedErrors,
     likeliest_shared_errors,
     offset_sigma_px,
 )
-from services.adjustment.short_motion import STILL, ShortMotion, short_motion
-from services.adjustment.structure import Structure, unfollowed_variance_px2
-from services.errors import NotEnoughPoints, UndeterminedCorrection
-from services.sensors.base import SensorModel
-from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
-from services.sensors.displacement import DisplacementGrid
-from services.types import Array, BoolArray, IntArray
+from amers.services.adjustment.short_motion import STILL, ShortMotion, short_motion
+from amers.services.adjustment.structure import Structure, unfollowed_variance_px2
+from amers.services.errors import NotEnoughPoints, UndeterminedCorrection
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.types import Array, BoolArray, IntArray
 
 _THIN = 1e-3
 """Smallest width of the area of the points that determines drift and skew, half sizes of the image."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from services.geodesy import lon_lat_h_from_ecef, move_metres
-from services.sensors.base import SensorModel
-from services.types import Array, IntArray, Observations
+from amers.services.geodesy import lon_lat_h_from_ecef, move_metres
+from amers.services.sensors.base import SensorModel
+from amers.services.types import Array, IntArray, Observations
 
 _ITERATIONS = 4
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
-from services.adjustment.parameters import AdjustableImage, BlockPriors
-from services.errors import InputError
-from services.sensors.displacement import DisplacementGrid
-from services.types import Array, BoolArray, Frame, IntArray
+from amers.services.adjustment.parameters import AdjustableImage, BlockPriors
+from amers.services.errors import InputError
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.types import Array, BoolArray, Frame, IntArray
 
 _SAME_PX = 0.01
 """Models that differ by less are the same."""

@@ -13,14 +13,14 @@ from itertools import combinations, product
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from services.adjustment.affine_fit import FREE, AffineFit
-from services.adjustment.displacement_components import MAX_CHANCE, Component, with_components
-from services.adjustment.displacement_solution import agreeing_with
-from services.adjustment.placed_measures import PlacedMeasures
-from services.adjustment.scene_motion import SceneMotion
-from services.adjustment.shared_errors import likeliest_shared_errors
-from services.adjustment.structure import Residuals
-from services.types import Array, BoolArray
+from amers.services.adjustment.affine_fit import FREE, AffineFit
+from amers.services.adjustment.displacement_components import MAX_CHANCE, Component, with_components
+from amers.services.adjustment.displacement_solution import agreeing_with
+from amers.services.adjustment.placed_measures import PlacedMeasures
+from amers.services.adjustment.scene_motion import SceneMotion
+from amers.services.adjustment.shared_errors import likeliest_shared_errors
+from amers.services.adjustment.structure import Residuals
+from amers.services.types import Array, BoolArray
 
 _LEAST_EVIDENCE = 8.0
 """Logarithm of how many times more likely ground that moved makes the measures, at least."""

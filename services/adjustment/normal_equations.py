@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from services.adjustment.robust import CAUCHY_TUNING
-from services.types import Array, IntArray
+from amers.services.adjustment.robust import CAUCHY_TUNING
+from amers.services.types import Array, IntArray
 
 _SINGULAR = 1e-13
 _PARALLEL = 1e-8

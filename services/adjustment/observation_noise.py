@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.sensors.base import SensorModel
-from services.types import Array, Observations
+from amers.services.sensors.base import SensorModel
+from amers.services.types import Array, Observations
 
 _POINTS = 2_000
 """Points that are enough to estimate the noise."""

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from services.adjustment.affine_fit import FREE, AffineFit, Order
-from services.conventions import MAX_ERROR_SIGMAS
-from services.types import BoolArray
+from amers.services.adjustment.affine_fit import FREE, AffineFit, Order
+from amers.services.conventions import MAX_ERROR_SIGMAS
+from amers.services.types import BoolArray
 
 
 def choose_order(

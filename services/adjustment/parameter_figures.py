@@ -6,8 +6,8 @@ from itertools import groupby
 
 import numpy as np
 
-from services.adjustment.bundle import BlockAdjustment
-from services.adjustment.parameters import AdjustableImage
+from amers.services.adjustment.bundle import BlockAdjustment
+from amers.services.adjustment.parameters import AdjustableImage
 
 HARDLY = 0.1
 """Share of a parameter that observations tell below which they do not determine it."""

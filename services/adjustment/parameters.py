@@ -8,11 +8,11 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy import sparse
 
-from services.adjustment.affine_fit import FREE, Order
-from services.sensors.base import SensorModel
-from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
-from services.sensors.displacement import DisplacementGrid
-from services.types import Array, BoolArray, IntArray
+from amers.services.adjustment.affine_fit import FREE, Order
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.types import Array, BoolArray, IntArray
 
 PASS_SHARE = 0.5
 """Share of the variance of the shifts that the images of a pass have in common, as the adjustment

@@ -5,17 +5,17 @@ from typing import Self
 
 import numpy as np
 
-from services.adjustment.affine_fit import AffineFit
-from services.adjustment.control_observations import ControlObservations
-from services.adjustment.displacement_components import Component, beyond, likeliest_components
-from services.adjustment.displacement_solution import agreeing_with
-from services.adjustment.shared_errors import SharedErrors, overlap_correlation
-from services.adjustment.structure import ALONG_AXES, OTHERWISE, Residuals, Structure, structures
-from services.sensors.base import SensorModel
-from services.sensors.correction import no_correction
-from services.sensors.displacement import DisplacementGrid
-from services.sensors.ortho import OrthoModel
-from services.types import Array, BoolArray
+from amers.services.adjustment.affine_fit import AffineFit
+from amers.services.adjustment.control_observations import ControlObservations
+from amers.services.adjustment.displacement_components import Component, beyond, likeliest_components
+from amers.services.adjustment.displacement_solution import agreeing_with
+from amers.services.adjustment.shared_errors import SharedErrors, overlap_correlation
+from amers.services.adjustment.structure import ALONG_AXES, OTHERWISE, Residuals, Structure, structures
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.correction import no_correction
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Array, BoolArray
 
 _OF_ITS_OWN = 1e-6
 """Share of its variance that each measure has for itself: chips that are the same have the same errors,

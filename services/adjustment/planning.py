@@ -5,20 +5,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.adjustment.block_accuracy import (
+from amers.services.adjustment.block_accuracy import (
     BlockAccuracy,
     block_accuracy,
     carried_covariances,
     earth_frames,
 )
-from services.adjustment.block_problem import BlockOptions, BlockProblem
-from services.adjustment.block_solution import checked_gauge
-from services.adjustment.control_ground import NO_CONTROL, ControlGround
-from services.adjustment.normal_equations import eliminated, reduced
-from services.adjustment.parameters import AdjustableImage, block_priors
-from services.adjustment.reduced_system import reduced_system
-from services.errors import NotEnoughPoints
-from services.types import Array, BoolArray, Frame, IntArray, Observations
+from amers.services.adjustment.block_problem import BlockOptions, BlockProblem
+from amers.services.adjustment.block_solution import checked_gauge
+from amers.services.adjustment.control_ground import NO_CONTROL, ControlGround
+from amers.services.adjustment.normal_equations import eliminated, reduced
+from amers.services.adjustment.parameters import AdjustableImage, block_priors
+from amers.services.adjustment.reduced_system import reduced_system
+from amers.services.errors import NotEnoughPoints
+from amers.services.types import Array, BoolArray, Frame, IntArray, Observations
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve, lapack
 from scipy.sparse.linalg import SuperLU, splu
 
-from services.adjustment.block_gauge import Gauge
-from services.adjustment.normal_equations import Pairs
-from services.adjustment.parameters import BlockPriors
-from services.adjustment.selected_inverse import selected_inverse
-from services.types import Array
+from amers.services.adjustment.block_gauge import Gauge
+from amers.services.adjustment.normal_equations import Pairs
+from amers.services.adjustment.parameters import BlockPriors
+from amers.services.adjustment.selected_inverse import selected_inverse
+from amers.services.types import Array
 
 DENSE_ROWS = 2000
 """Largest matrix that is solved densely."""

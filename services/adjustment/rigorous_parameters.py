@@ -5,15 +5,15 @@ from functools import cached_property
 
 import numpy as np
 
-from services.adjustment.parameters import Computed, FreeParameter
-from services.errors import InputError
-from services.sensors.correction import ImageCorrection
-from services.sensors.displacement import DisplacementGrid
-from services.sensors.moving_pushbroom import moving_model
-from services.sensors.parameter_sets import UNITS, ParameterSet
-from services.sensors.pushbroom import PushbroomModel
-from services.sensors.pushbroom_errors import TERMS, PushbroomErrors
-from services.types import Array, BoolArray, IntArray
+from amers.services.adjustment.parameters import Computed, FreeParameter
+from amers.services.errors import InputError
+from amers.services.sensors.correction import ImageCorrection
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.sensors.moving_pushbroom import moving_model
+from amers.services.sensors.parameter_sets import UNITS, ParameterSet
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.sensors.pushbroom_errors import TERMS, PushbroomErrors
+from amers.services.types import Array, BoolArray, IntArray
 
 _PER_SI = np.repeat([1e6, 1.0, 1e6], [6, 6, 2])
 _LOCATING = ("roll", "pitch", "along track", "across track", "radial")

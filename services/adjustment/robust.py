@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from services.types import Array, BoolArray
+from amers.services.types import Array, BoolArray
 
 MAD_TO_STD = 1.4826
 CAUCHY_TUNING = 2.385

@@ -3,8 +3,8 @@
 import numpy as np
 from numba import njit
 
-from services.adjustment.robust import CAUCHY_TUNING, MAD_TO_STD, ROUNDING
-from services.types import Array, BoolArray
+from amers.services.adjustment.robust import CAUCHY_TUNING, MAD_TO_STD, ROUNDING
+from amers.services.types import Array, BoolArray
 
 _STEPS = 20
 _STEADY_PX = 1e-4

@@ -2,14 +2,20 @@
 
 import numpy as np
 
-from services.adjustment.block_problem import BlockProblem
-from services.adjustment.block_scale import LEAST_SCALE, check_scale, low_scale, magnitude, robust_scale
-from services.adjustment.block_solution import State, checked_gauge, moved, step, unsettled
-from services.adjustment.control_check import robust_control, robust_single_rays
-from services.adjustment.normal_equations import RobustTerms, robust_points
-from services.adjustment.parameters import BlockPriors
-from services.errors import NotEnoughPoints
-from services.types import Array, BoolArray
+from amers.services.adjustment.block_problem import BlockProblem
+from amers.services.adjustment.block_scale import (
+    LEAST_SCALE,
+    check_scale,
+    low_scale,
+    magnitude,
+    robust_scale,
+)
+from amers.services.adjustment.block_solution import State, checked_gauge, moved, step, unsettled
+from amers.services.adjustment.control_check import robust_control, robust_single_rays
+from amers.services.adjustment.normal_equations import RobustTerms, robust_points
+from amers.services.adjustment.parameters import BlockPriors
+from amers.services.errors import NotEnoughPoints
+from amers.services.types import Array, BoolArray
 
 _NEARLY_PX = 0.02
 """Change of the parameters at which least squares take over."""

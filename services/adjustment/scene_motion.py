@@ -4,14 +4,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.affine_fit import AffineFit
-from services.adjustment.broken_image import placed_steps, steps_at_breaks
-from services.adjustment.displacement_components import Component
-from services.adjustment.displacement_solution import solve_displacement
-from services.adjustment.placed_measures import PlacedMeasures
-from services.adjustment.structure import Structure
-from services.sensors.correction import no_correction
-from services.types import Array, BoolArray, IntArray
+from amers.services.adjustment.affine_fit import AffineFit
+from amers.services.adjustment.broken_image import placed_steps, steps_at_breaks
+from amers.services.adjustment.displacement_components import Component
+from amers.services.adjustment.displacement_solution import solve_displacement
+from amers.services.adjustment.placed_measures import PlacedMeasures
+from amers.services.adjustment.structure import Structure
+from amers.services.sensors.correction import no_correction
+from amers.services.types import Array, BoolArray, IntArray
 
 _LEFT_OUT = 5
 """Measures that disagree with an affine correction, from which on a profile is looked for in all."""

@@ -6,16 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from services.adjustment.affine_fit import AffineFit
-from services.adjustment.bends import bends
-from services.adjustment.displacement_components import Component, unit_variance, with_components
-from services.adjustment.displacement_solution import joined, solve_displacement
-from services.adjustment.placed_measures import PlacedMeasures
-from services.adjustment.shared_errors import SharedErrors
-from services.adjustment.structure import Residuals
-from services.adjustment.unseen_seams import unseen_seams
-from services.sensors.displacement import DisplacementGrid
-from services.types import Array, BoolArray
+from amers.services.adjustment.affine_fit import AffineFit
+from amers.services.adjustment.bends import bends
+from amers.services.adjustment.displacement_components import Component, unit_variance, with_components
+from amers.services.adjustment.displacement_solution import joined, solve_displacement
+from amers.services.adjustment.placed_measures import PlacedMeasures
+from amers.services.adjustment.shared_errors import SharedErrors
+from amers.services.adjustment.structure import Residuals
+from amers.services.adjustment.unseen_seams import unseen_seams
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.types import Array, BoolArray
 
 
 @dataclass(frozen=True)

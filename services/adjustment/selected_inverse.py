@@ -7,8 +7,8 @@ from numba import njit
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU
 
-from services.adjustment.normal_equations import Pairs
-from services.types import Array, IntArray
+from amers.services.adjustment.normal_equations import Pairs
+from amers.services.types import Array, IntArray
 
 
 class _Inverse(NamedTuple):

@@ -17,9 +17,9 @@ from scipy.linalg import solve_triangular
 from scipy.spatial.distance import cdist
 from scipy.special import ndtr
 
-from services.adjustment.affine_fit import AffineFit, inverse_normal
-from services.adjustment.robust import MAD_TO_STD
-from services.types import Array, BoolArray
+from amers.services.adjustment.affine_fit import AffineFit, inverse_normal
+from amers.services.adjustment.robust import MAD_TO_STD
+from amers.services.types import Array, BoolArray
 
 _LENGTHS = np.array([0.05, 0.1, 0.2])
 """Correlation lengths that are considered, sides of the image."""

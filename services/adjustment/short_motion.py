@@ -1,8 +1,8 @@
 """Motion of a sensor within the lines of a chip, which positions of chips average out and cannot show.
 
-Strips of the chips are displaced against their chips, see `services.matching.chip_strips`. What relief
-does to a chip changes from point to point; what the sensor did at a line is the same in all chips that
-show it. A parabola is left out of each chip, so that neither errors of the points nor smooth relief
+Strips of the chips are displaced against their chips, see `amers.services.matching.chip_strips`. What
+relief does to a chip changes from point to point; what the sensor did at a line is the same in all chips
+that show it. A parabola is left out of each chip, so that neither errors of the points nor smooth relief
 count.
 """
 
@@ -12,9 +12,9 @@ from typing import Self
 import numpy as np
 from scipy.special import fdtrc
 
-from services.adjustment.structure import Structure, probability_of_structure
-from services.sensors.displacement import DisplacementGrid
-from services.types import Array, BoolArray, IntArray
+from amers.services.adjustment.structure import Structure, probability_of_structure
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.types import Array, BoolArray, IntArray
 
 STRIPS = 8
 """Strips of a chip across the lines of a scene."""

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import orth, solve_triangular
 from scipy.special import fdtrc
 
-from services.types import Array
+from amers.services.types import Array
 
 Family = Literal["lines", "steps", "samples", "seams", "image", "height", "chips"]
 """What residuals may depend on; "steps" are along the lines, "seams" steps along the samples, "chips"

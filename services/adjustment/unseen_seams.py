@@ -11,8 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from services.adjustment.displacement_components import Component
-from services.types import Array
+from amers.services.adjustment.displacement_components import Component
+from amers.services.types import Array
 
 _FEWEST = 2
 """Seams that make a rate: a single one is that of an image put together from two."""

@@ -26,7 +26,7 @@ from obstore.exceptions import (
 )
 from obstore.store import HTTPStore, S3Store
 
-from services.errors import FormatError
+from amers.services.errors import FormatError
 
 SCHEMES = ("s3", "https", "http")
 BLOCK_BYTES = 1 << 20

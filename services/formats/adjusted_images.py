@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from services.adjustment.known_images import KnownImages
-from services.errors import FormatError
-from services.sensors.displacement import DisplacementGrid
-from services.types import Frame
+from amers.services.adjustment.known_images import KnownImages
+from amers.services.errors import FormatError
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.types import Frame
 
 FORMAT = "amers-images/3"
 _WITHOUT_DISPLACEMENTS = "amers-images/2"

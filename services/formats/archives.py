@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO, cast
 
-from services.errors import FormatError
+from amers.services.errors import FormatError
 
 ZIP = b"PK\x03\x04"
 GZIP = b"\x1f\x8b"

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from services.errors import FormatError
-from services.formats.images.raster import RasterImage, map_grid_of, open_raster
-from services.formats.stac.catalogue import parse_area
-from services.formats.text_files import load_json, read_text
-from services.imagery.source import Window
-from services.map_grid import MapGrid
-from services.quality.density import GroundMask
-from services.types import Array, BoolArray, IntArray
+from amers.services.errors import FormatError
+from amers.services.formats.images.raster import RasterImage, map_grid_of, open_raster
+from amers.services.formats.stac.catalogue import parse_area
+from amers.services.formats.text_files import load_json, read_text
+from amers.services.imagery.source import Window
+from amers.services.map_grid import MapGrid
+from amers.services.quality.density import GroundMask
+from amers.services.types import Array, BoolArray, IntArray
 
 LandCover = Callable[[Array], list[str]]
 """The land cover at positions (n, 2) of longitude and latitude."""

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from services.errors import FormatError
+from amers.services.errors import FormatError
 
 
 def folder_member(folder: Path, name: str, what: str) -> Path:

@@ -5,8 +5,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from services.errors import FormatError
-from services.formats.addresses import Address, FilePlace
+from amers.services.errors import FormatError
+from amers.services.formats.addresses import Address, FilePlace
 
 NUMBER_PATTERN = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 """Pattern of a decimal number; "nan" and "inf" do not match."""

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from services.errors import FormatError, InputError
-from services.tasks import Arrays
+from amers.services.errors import FormatError, InputError
+from amers.services.tasks import Arrays
 
 _INPUTS = "inputs.json"
 

@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from services.types import Array, BoolArray, IntArray
+from amers.services.types import Array, BoolArray, IntArray
 
 Shapes = npt.NDArray[np.object_]
 """Shapely geometries, or None."""
@@ -19,7 +19,7 @@ class ImageCatalogue:
     Attributes:
         id: (n,) str, unique.
         footprint: (n,) polygons or multipolygons with continuous longitudes, see
-            `services.imagery.footprints.footprint_on_ground`.
+            `amers.services.imagery.footprints.footprint_on_ground`.
         mask: (n,) what hides the ground, clouds and the like, in the same form; its polygons may
             overlap, and it is empty where nothing does. None where the catalogue has no mask.
         acquired: (n,) datetime64[ms], UTC.

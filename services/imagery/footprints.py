@@ -7,7 +7,7 @@ as an edge along the latitude of 90 degrees. So every footprint is a plain polyg
 import numpy as np
 import shapely
 
-from services.types import Array
+from amers.services.types import Array
 
 _POLAR_LATITUDE_DEG = 75.0
 """Footprints that reach beyond have edges in the plane of the pole, where straight lines are short."""

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from services.types import Array, BoolArray, FloatImage
+from amers.services.types import Array, BoolArray, FloatImage
 
 LOST_SHARE = 0.5
 """Share of gaps in the footprint of a pixel above which the pixel is lost."""

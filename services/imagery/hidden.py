@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import shapely
 
-from services.imagery.scene import Scene, scene_centre
-from services.imagery.source import ImageSource, Window
-from services.types import Array, FloatImage
+from amers.services.imagery.scene import Scene, scene_centre
+from amers.services.imagery.source import ImageSource, Window
+from amers.services.types import Array, FloatImage
 
 _SUBPIXEL_BITS = 4
 

@@ -11,10 +11,10 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.special import bdtrc
 
-from services.imagery.scene import Scene
-from services.imagery.source import ImageSource, Window
-from services.sensors.ortho import OrthoModel
-from services.types import Array, FloatImage, IntArray
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ImageSource, Window
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Array, FloatImage, IntArray
 
 _PARTS = 32
 """Parts of the width that are looked at, each by itself."""

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numba import njit
 
-from services.imagery.gaps import filled, lost_pixels
-from services.types import Array, FloatImage
+from amers.services.imagery.gaps import filled, lost_pixels
+from amers.services.types import Array, FloatImage
 
 _POLE = np.sqrt(3.0) - 2.0
 SPLINE_REACH_PX = 8

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from services.geodesy import ecef_from_east_north_up
-from services.imagery.source import ImageSource, image_gsd_m
-from services.sensors.base import SensorModel
-from services.sensors.parameter_sets import ParameterSet
-from services.types import Acquisition, Array
+from amers.services.geodesy import ecef_from_east_north_up
+from amers.services.imagery.source import ImageSource, image_gsd_m
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.parameter_sets import ParameterSet
+from amers.services.types import Acquisition, Array
 
 FOOTPRINT_PER_SIDE = 8
 """Positions along each side of an image that are located for its footprint."""

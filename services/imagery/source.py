@@ -7,12 +7,12 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from services.conventions import CHIP_CENTRE
-from services.geodesy import lon_lat_h_from_east_north_up
-from services.imagery.gaps import LOST_SHARE, filled, lost_pixels
-from services.imagery.resampling import finite_bounds, resample, spline_coefficients
-from services.sensors.base import SensorModel
-from services.types import Array, FloatImage
+from amers.services.conventions import CHIP_CENTRE
+from amers.services.geodesy import lon_lat_h_from_east_north_up
+from amers.services.imagery.gaps import LOST_SHARE, filled, lost_pixels
+from amers.services.imagery.resampling import finite_bounds, resample, spline_coefficients
+from amers.services.sensors.base import SensorModel
+from amers.services.types import Array, FloatImage
 
 _MARGIN_PX = 6
 """Pixels read beyond the positions sampled, so that the spline does not depend on the window."""

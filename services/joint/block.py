@@ -5,20 +5,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.block_problem import BlockOptions
-from services.adjustment.bundle import BlockAdjustment, adjust_block
-from services.adjustment.control_ground import ControlGround
-from services.adjustment.known_images import KnownImages
-from services.adjustment.parameters import AdjustableImage, ImageParameters, image_parameters
-from services.adjustment.rigorous_parameters import rigorous_parameters
-from services.imagery.scene import scene_gsd_m
-from services.joint.measured import MeasuredScene
-from services.quality.frames import why_unknown
-from services.registration.options import RegistrationOptions
-from services.sensors.base import SensorModel
-from services.sensors.displacement import DisplacementGrid
-from services.sensors.pushbroom import PushbroomModel
-from services.types import (
+from amers.services.adjustment.block_problem import BlockOptions
+from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
+from amers.services.adjustment.control_ground import ControlGround
+from amers.services.adjustment.known_images import KnownImages
+from amers.services.adjustment.parameters import AdjustableImage, ImageParameters, image_parameters
+from amers.services.adjustment.rigorous_parameters import rigorous_parameters
+from amers.services.imagery.scene import scene_gsd_m
+from amers.services.joint.measured import MeasuredScene
+from amers.services.quality.frames import why_unknown
+from amers.services.registration.options import RegistrationOptions
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.types import (
     Array,
     BoolArray,
     Frame,

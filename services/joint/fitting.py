@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.adjustment.known_images import KnownImages
-from services.errors import ComputationError, DoesNotFit
-from services.joint.block import JointBlock, adjust_together
-from services.joint.measured import MeasuredScene
-from services.registration.options import RegistrationOptions
-from services.types import BoolArray, IntArray, Observations
+from amers.services.adjustment.known_images import KnownImages
+from amers.services.errors import ComputationError, DoesNotFit
+from amers.services.joint.block import JointBlock, adjust_together
+from amers.services.joint.measured import MeasuredScene
+from amers.services.registration.options import RegistrationOptions
+from amers.services.types import BoolArray, IntArray, Observations
 
 LEAST_USED = 0.6
 """Share of the measures of a scene that agree, of a scene that fits."""

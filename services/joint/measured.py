@@ -5,19 +5,19 @@ from functools import cached_property
 
 import numpy as np
 
-from services.adjustment.control_observations import ControlObservations
-from services.adjustment.image_correction import SceneAdjustment
-from services.imagery.scene import Scene
-from services.matching.control_points import PointMatches
-from services.quality.lack_of_fit import Elsewhere
-from services.registration.context import SearchStage
-from services.registration.options import RegistrationOptions
-from services.registration.search import Search, control_observations
-from services.sensors.correction import ImageCorrection
-from services.sensors.displacement import DisplacementGrid
-from services.sensors.moving_pushbroom import moving_model
-from services.sensors.pushbroom import PushbroomModel
-from services.types import Array, BoolArray, ControlPoints, ViewMeasures
+from amers.services.adjustment.control_observations import ControlObservations
+from amers.services.adjustment.image_correction import SceneAdjustment
+from amers.services.imagery.scene import Scene
+from amers.services.matching.control_points import PointMatches
+from amers.services.quality.lack_of_fit import Elsewhere
+from amers.services.registration.context import SearchStage
+from amers.services.registration.options import RegistrationOptions
+from amers.services.registration.search import Search, control_observations
+from amers.services.sensors.correction import ImageCorrection
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.sensors.moving_pushbroom import moving_model
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.types import Array, BoolArray, ControlPoints, ViewMeasures
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.parameters import AdjustableImage, ImageParameters
-from services.joint.block import JointBlock
-from services.sensors.correction import ImageCorrection, no_correction
-from services.types import Array
+from amers.services.adjustment.parameters import AdjustableImage, ImageParameters
+from amers.services.joint.block import JointBlock
+from amers.services.sensors.correction import ImageCorrection, no_correction
+from amers.services.types import Array
 
 _SIDE = 9
 """Places a side of an image at which models are compared, at the lowest and the highest ground."""

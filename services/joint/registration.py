@@ -7,15 +7,15 @@ from functools import partial
 
 import numpy as np
 
-from services.adjustment.known_images import KnownImages
-from services.errors import ComputationError, CoverageError, DoesNotFit
-from services.imagery.line_breaks import scene_breaks
-from services.imagery.scene import Scene
-from services.imagery.source import CachedImage, image_gsds_m
-from services.joint.block import JointBlock, repeated
-from services.joint.fitting import Left, SceneFit, adjust_fitting, scene_fit, ties_between
-from services.joint.measured import MeasuredScene, nothing_found, options_in_block
-from services.joint.results import (
+from amers.services.adjustment.known_images import KnownImages
+from amers.services.errors import ComputationError, CoverageError, DoesNotFit
+from amers.services.imagery.line_breaks import scene_breaks
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import CachedImage, image_gsds_m
+from amers.services.joint.block import JointBlock, repeated
+from amers.services.joint.fitting import Left, SceneFit, adjust_fitting, scene_fit, ties_between
+from amers.services.joint.measured import MeasuredScene, nothing_found, options_in_block
+from amers.services.joint.results import (
     RigorousScene,
     held_cells,
     held_draws,
@@ -23,21 +23,21 @@ from services.joint.results import (
     rigorous_scene,
     scene_measures,
 )
-from services.matching.ground_features import FeatureOptions
-from services.production.image_passes import image_passes
-from services.production.point_views import check_image_names
-from services.production.tie_points import find_tie_points
-from services.registration.chip_selection import fine_gsd_m
-from services.registration.context import PointContext, Prediction, SearchStage
-from services.registration.elsewhere import adjust_with_places
-from services.registration.on_points import Registration, search_near, search_scene
-from services.registration.options import RegistrationOptions
-from services.registration.point_selection import initial_prediction, points_to_try, visible_points
-from services.registration.search import adjust_search
-from services.sensors.correction import CorrectedModel, no_correction
-from services.sensors.pushbroom import PushbroomModel
-from services.tasks import Work
-from services.types import (
+from amers.services.matching.ground_features import FeatureOptions
+from amers.services.production.image_passes import image_passes
+from amers.services.production.point_views import check_image_names
+from amers.services.production.tie_points import find_tie_points
+from amers.services.registration.chip_selection import fine_gsd_m
+from amers.services.registration.context import PointContext, Prediction, SearchStage
+from amers.services.registration.elsewhere import adjust_with_places
+from amers.services.registration.on_points import Registration, search_near, search_scene
+from amers.services.registration.options import RegistrationOptions
+from amers.services.registration.point_selection import initial_prediction, points_to_try, visible_points
+from amers.services.registration.search import adjust_search
+from amers.services.sensors.correction import CorrectedModel, no_correction
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.tasks import Work
+from amers.services.types import (
     Array,
     ChipSource,
     ControlPoints,

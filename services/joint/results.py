@@ -5,32 +5,32 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.control_observations import declared_fit
-from services.adjustment.image_correction import SceneAdjustment, deformation_covariance
-from services.adjustment.parameter_figures import (
+from amers.services.adjustment.control_observations import declared_fit
+from amers.services.adjustment.image_correction import SceneAdjustment, deformation_covariance
+from amers.services.adjustment.parameter_figures import (
     ParameterFigure,
     held_parameters,
     parameter_figures,
 )
-from services.adjustment.placed_measures import PlacedMeasures
-from services.adjustment.rigorous_parameters import RigorousParameters
-from services.adjustment.shared_errors import SharedErrors
-from services.adjustment.short_motion import STILL
-from services.conventions import CHIP_SIZE
-from services.imagery.scene import scene_gsd_m
-from services.joint.block import JointBlock
-from services.joint.nearest import nearest_correction, scene_heights_m
-from services.quality.cell_stability import cell_stability_of, cells_of
-from services.quality.frames import shared_frame, weighted_frame
-from services.quality.qualification import QualificationOptions, qualify_repeated
-from services.quality.stability import AdjustedScene, Repetition, stability_of
-from services.registration.on_points import Registration
-from services.registration.options import RegistrationOptions
-from services.registration.point_results import point_results
-from services.registration.search import shears_of_active
-from services.sensors.moving_pushbroom import AttitudeMotion, attitude_motion
-from services.sensors.pushbroom import PushbroomModel
-from services.types import Array, BoolArray, IntArray, Measures
+from amers.services.adjustment.placed_measures import PlacedMeasures
+from amers.services.adjustment.rigorous_parameters import RigorousParameters
+from amers.services.adjustment.shared_errors import SharedErrors
+from amers.services.adjustment.short_motion import STILL
+from amers.services.conventions import CHIP_SIZE
+from amers.services.imagery.scene import scene_gsd_m
+from amers.services.joint.block import JointBlock
+from amers.services.joint.nearest import nearest_correction, scene_heights_m
+from amers.services.quality.cell_stability import cell_stability_of, cells_of
+from amers.services.quality.frames import shared_frame, weighted_frame
+from amers.services.quality.qualification import QualificationOptions, qualify_repeated
+from amers.services.quality.stability import AdjustedScene, Repetition, stability_of
+from amers.services.registration.on_points import Registration
+from amers.services.registration.options import RegistrationOptions
+from amers.services.registration.point_results import point_results
+from amers.services.registration.search import shears_of_active
+from amers.services.sensors.moving_pushbroom import AttitudeMotion, attitude_motion
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.types import Array, BoolArray, IntArray, Measures
 
 _INDEPENDENT = SharedErrors(1.0, np.zeros(3), 0.0)
 

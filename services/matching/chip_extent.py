@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from services.types import FloatImage
+from amers.services.types import FloatImage
 
 MIN_VISIBLE_SIDE = 0.5
 """Smallest part of a chip that is searched, as a fraction of the chip's half side."""

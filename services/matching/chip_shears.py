@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.matching.correlate import Peak
-from services.matching.least_squares_kernels import CELL_PX
-from services.types import Array, BoolArray, IntArray
+from amers.services.matching.correlate import Peak
+from amers.services.matching.least_squares_kernels import CELL_PX
+from amers.services.types import Array, BoolArray, IntArray
 
 
 @dataclass(frozen=True)

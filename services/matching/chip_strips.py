@@ -8,10 +8,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from services.adjustment.short_motion import STRIPS, ChipStrips
-from services.matching.least_squares_kernels import CELL_PX
-from services.matching.view_combination import ViewCombination
-from services.types import Array
+from amers.services.adjustment.short_motion import STRIPS, ChipStrips
+from amers.services.matching.least_squares_kernels import CELL_PX
+from amers.services.matching.view_combination import ViewCombination
+from amers.services.types import Array
 
 _LEAST_LEVERAGE = 0.01
 """Smallest leverage of a strip, in each direction, from which on its displacement is known."""

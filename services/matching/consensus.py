@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
-from services.conventions import MAX_ERROR_SIGMAS
-from services.types import Array, BoolArray, IntArray
+from amers.services.conventions import MAX_ERROR_SIGMAS
+from amers.services.types import Array, BoolArray, IntArray
 
 MEDIAN_DISTANCE = float(np.sqrt(2.0 * np.log(2.0)))
 """Median distance from the centre of a circular normal distribution of unit sigma (1.177)."""

@@ -5,11 +5,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from services.adjustment.short_motion import ChipStrips
-from services.conventions import CHIP_CENTRE
-from services.geodesy import move_metres
-from services.imagery.gaps import bridged, missing_reason
-from services.imagery.source import (
+from amers.services.adjustment.short_motion import ChipStrips
+from amers.services.conventions import CHIP_CENTRE
+from amers.services.geodesy import move_metres
+from amers.services.imagery.gaps import bridged, missing_reason
+from amers.services.imagery.source import (
     ImageSource,
     ReducedImage,
     chip_positions,
@@ -17,10 +17,10 @@ from services.imagery.source import (
     low_pass,
     sample_image,
 )
-from services.matching.chip_extent import central_square, visible_half_side
-from services.matching.chip_shears import ChipShears, chip_shears
-from services.matching.chip_strips import chip_strips
-from services.matching.correlate import (
+from amers.services.matching.chip_extent import central_square, visible_half_side
+from amers.services.matching.chip_shears import ChipShears, chip_shears
+from amers.services.matching.chip_strips import chip_strips
+from amers.services.matching.correlate import (
     FOUND,
     CorrelationOptions,
     Peak,
@@ -28,18 +28,18 @@ from services.matching.correlate import (
     find_chip,
     rejected,
 )
-from services.matching.radiometry import gradient_image, mark_clouds, patch_statistics
-from services.matching.shadows import ShadowShift, shadow_shift
-from services.matching.systematic_error import common_covariance_px2, parallax_vectors
-from services.matching.view_combination import (
+from amers.services.matching.radiometry import gradient_image, mark_clouds, patch_statistics
+from amers.services.matching.shadows import ShadowShift, shadow_shift
+from amers.services.matching.systematic_error import common_covariance_px2, parallax_vectors
+from amers.services.matching.view_combination import (
     ViewCombination,
     combine_views,
     combined_sigmas_px,
     no_measure,
 )
-from services.matching.view_selection import ViewDistanceScales, select_views
-from services.sensors.base import SensorModel
-from services.types import (
+from amers.services.matching.view_selection import ViewDistanceScales, select_views
+from amers.services.sensors.base import SensorModel
+from amers.services.types import (
     Acquisition,
     Array,
     BoolArray,

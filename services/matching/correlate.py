@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from services.imagery.gaps import filled, missing_reason
-from services.matching.least_squares import covariance_from_influence, fit_chip
-from services.matching.shadows import ShadowShift, shadow_weights
-from services.types import Array, BoolArray, FloatImage
+from amers.services.imagery.gaps import filled, missing_reason
+from amers.services.matching.least_squares import covariance_from_influence, fit_chip
+from amers.services.matching.shadows import ShadowShift, shadow_weights
+from amers.services.types import Array, BoolArray, FloatImage
 
 FOUND = ""
 

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from services.geodesy import east_north_up, lon_lat_h_from_east_north_up
-from services.imagery.gaps import bridged, filled
-from services.imagery.scene import Scene, scene_centre, scene_gsd_m
-from services.imagery.source import chip_positions, render_chip
-from services.types import Array, FloatImage
+from amers.services.geodesy import east_north_up, lon_lat_h_from_east_north_up
+from amers.services.imagery.gaps import bridged, filled
+from amers.services.imagery.scene import Scene, scene_centre, scene_gsd_m
+from amers.services.imagery.source import chip_positions, render_chip
+from amers.services.types import Array, FloatImage
 
 _LARGEST_PX = 1100
 """Largest side of the parts of the ground in which features are found."""

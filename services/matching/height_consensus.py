@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.special import bdtrc, gammaln
 
-from services.matching.consensus import Consensus
-from services.types import Array, BoolArray
+from amers.services.matching.consensus import Consensus
+from amers.services.types import Array, BoolArray
 
 _TELLING = 2.0
 """Displacements that tell a slope, tolerances."""

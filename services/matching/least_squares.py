@@ -5,15 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.imagery.gaps import filled
-from services.imagery.resampling import SPLINE_REACH_PX, resample, spline_coefficients
-from services.matching.least_squares_kernels import (
+from amers.services.imagery.gaps import filled
+from amers.services.imagery.resampling import SPLINE_REACH_PX, resample, spline_coefficients
+from amers.services.matching.least_squares_kernels import (
     REACH_PX,
     add_bartlett_sums,
     fit_position,
     neighbour_correlation,
 )
-from services.types import Array, BoolArray, FloatImage
+from amers.services.types import Array, BoolArray, FloatImage
 
 _ALL = np.zeros((0, 0), dtype=np.float32)
 """The mask of pixels in use where all are."""

@@ -3,8 +3,8 @@
 import numpy as np
 from numba import njit
 
-from services.imagery.resampling import spline_weights
-from services.types import Array, FloatImage
+from amers.services.imagery.resampling import spline_weights
+from amers.services.types import Array, FloatImage
 
 MAX_STEPS = 12
 STEP_PX = 2e-3

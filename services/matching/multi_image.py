@@ -5,13 +5,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from services.conventions import CHIP_CENTRE, CHIP_SIZE
-from services.geodesy import move_metres
-from services.imagery.scene import Scene
-from services.imagery.source import image_gsd_m, render_chip
-from services.matching.correlate import FOUND, CorrelationOptions, correlation_map, find_chip
-from services.sensors.base import SensorModel
-from services.types import (
+from amers.services.conventions import CHIP_CENTRE, CHIP_SIZE
+from amers.services.geodesy import move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import image_gsd_m, render_chip
+from amers.services.matching.correlate import FOUND, CorrelationOptions, correlation_map, find_chip
+from amers.services.sensors.base import SensorModel
+from amers.services.types import (
     Array,
     BoolArray,
     ChipArray,

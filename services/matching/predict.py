@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from services.types import Array, BoolArray, IntArray
+from amers.services.types import Array, BoolArray, IntArray
 
 
 def in_image(line_sample: Array, shape: tuple[int, int], margin_px: Array | float) -> BoolArray:

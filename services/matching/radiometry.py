@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numba import njit
 
-from services.imagery.gaps import LOST_SHARE
-from services.types import Array, BoolArray, FloatImage
+from amers.services.imagery.gaps import LOST_SHARE
+from amers.services.types import Array, BoolArray, FloatImage
 
 MIN_FOUND = 5
 """Fewest points found whose surroundings serve as the reference for those of the others."""

@@ -4,9 +4,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from services.errors import InputError
-from services.imagery.gaps import bridged
-from services.imagery.source import (
+from amers.services.errors import InputError
+from amers.services.imagery.gaps import bridged
+from amers.services.imagery.source import (
     ArrayImage,
     ImageSource,
     ReducedImage,
@@ -17,13 +17,13 @@ from services.imagery.source import (
     low_pass,
     sample_image,
 )
-from services.lines_of_sight import intersect_terrain
-from services.matching.control_points import PointMatches
-from services.matching.correlate import FOUND, CorrelationOptions, find_chip
-from services.matching.radiometry import mark_clouds, patch_statistics
-from services.sensors.base import SensorModel
-from services.terrain import Terrain
-from services.types import (
+from amers.services.lines_of_sight import intersect_terrain
+from amers.services.matching.control_points import PointMatches
+from amers.services.matching.correlate import FOUND, CorrelationOptions, find_chip
+from amers.services.matching.radiometry import mark_clouds, patch_statistics
+from amers.services.sensors.base import SensorModel
+from amers.services.terrain import Terrain
+from amers.services.types import (
     UNKNOWN_FRAME,
     Array,
     FloatImage,

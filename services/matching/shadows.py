@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from services.types import Acquisition, Array, FloatImage
+from amers.services.types import Acquisition, Array, FloatImage
 
 CASTER_M = 6.0
 """Assumed height of the objects that cast shadows: houses of two floors, small trees."""

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from services.imagery.scene import Scene
-from services.imagery.source import render_chip
-from services.matching.correlate import correlation_map
-from services.sensors.base import SensorModel
-from services.types import Array, FloatImage
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import render_chip
+from amers.services.matching.correlate import correlation_map
+from amers.services.sensors.base import SensorModel
+from amers.services.types import Array, FloatImage
 
 _PART_PX = 11
 """Side of a part: small enough to lie on one surface, large enough to be found."""

@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from services.adjustment.robust import MAD_TO_STD
-from services.matching.shadows import shadow_vector
-from services.types import Acquisition, Array, IntArray, Views
+from amers.services.adjustment.robust import MAD_TO_STD
+from amers.services.matching.shadows import shadow_vector
+from amers.services.types import Acquisition, Array, IntArray, Views
 
 COMMON_SIGMA_PX = 0.035
 """Smallest systematic error of a registration, chip pixels: shadows that all turn the same way."""

@@ -5,11 +5,11 @@ from functools import cached_property
 
 import numpy as np
 
-from services.conventions import MAX_ERROR_SIGMAS
-from services.imagery.scene import Scene, scene_gsd_m
-from services.matching.ground_features import Features
-from services.sensors.base import SensorModel
-from services.types import Array, BoolArray, FloatImage, IntArray
+from amers.services.conventions import MAX_ERROR_SIGMAS
+from amers.services.imagery.scene import Scene, scene_gsd_m
+from amers.services.matching.ground_features import Features
+from amers.services.sensors.base import SensorModel
+from amers.services.types import Array, BoolArray, FloatImage, IntArray
 
 _MIN_PAIRS = 8
 """Fewest matches of two images from which their relative error is estimated."""

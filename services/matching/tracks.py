@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numba
 import numpy as np
 
-from services.matching.tie_points import Matches
-from services.types import Array, BoolArray, IntArray
+from amers.services.matching.tie_points import Matches
+from amers.services.types import Array, BoolArray, IntArray
 
 
 def tracks(image: IntArray, links: Sequence[tuple[int, int, Matches]], start: IntArray) -> IntArray:

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.matching.correlate import FOUND, Peak, sigma_per_coordinate
-from services.matching.least_squares import covariance_from_influence
-from services.types import Array, BoolArray, IntArray
+from amers.services.matching.correlate import FOUND, Peak, sigma_per_coordinate
+from amers.services.matching.least_squares import covariance_from_influence
+from amers.services.types import Array, BoolArray, IntArray
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.matching.predict import rank_in_group
-from services.types import Acquisition, Array, ControlPoints, IntArray, Views
+from amers.services.matching.predict import rank_in_group
+from amers.services.types import Acquisition, Array, ControlPoints, IntArray, Views
 
 DAYS_OF_A_YEAR = 365.25
 

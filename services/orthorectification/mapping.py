@@ -13,12 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from services.errors import ComputationError
-from services.imagery.source import Window
-from services.map_grid import MapGrid
-from services.sensors.base import SensorModel
-from services.terrain import Terrain
-from services.types import Array, BoolArray, FloatImage
+from amers.services.errors import ComputationError
+from amers.services.imagery.source import Window
+from amers.services.map_grid import MapGrid
+from amers.services.sensors.base import SensorModel
+from amers.services.terrain import Terrain
+from amers.services.types import Array, BoolArray, FloatImage
 
 NODE_PX = 64
 """Map pixels between the nodes at the start."""

@@ -6,12 +6,12 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial import QhullError
 
-from services.errors import CoverageError
-from services.geodesy import longitudes_near
-from services.imagery.source import ArrayImage
-from services.map_grid import MapGrid
-from services.terrain import Terrain
-from services.types import Array
+from amers.services.errors import CoverageError
+from amers.services.geodesy import longitudes_near
+from amers.services.imagery.source import ArrayImage
+from amers.services.map_grid import MapGrid
+from amers.services.terrain import Terrain
+from amers.services.types import Array
 
 _NODES = 129
 """Nodes of the terrain along each side."""

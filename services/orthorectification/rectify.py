@@ -8,16 +8,16 @@ from typing import Literal
 import numpy as np
 from numba import njit
 
-from services.errors import CoverageError, InputError
-from services.geodesy import metres_per_degree
-from services.imagery.gaps import LOST_SHARE
-from services.imagery.scene import Scene, scene_gsd_m
-from services.imagery.source import ImageSource, Window, block_means, low_pass
-from services.map_grid import MapGrid, check_map_code, utm_of, xy_of_lon_lat
-from services.orthorectification.mapping import map_into_image, occluded_ground
-from services.sensors.base import SensorModel
-from services.terrain import Terrain
-from services.types import Array, FloatImage, IntArray, Progress, no_progress
+from amers.services.errors import CoverageError, InputError
+from amers.services.geodesy import metres_per_degree
+from amers.services.imagery.gaps import LOST_SHARE
+from amers.services.imagery.scene import Scene, scene_gsd_m
+from amers.services.imagery.source import ImageSource, Window, block_means, low_pass
+from amers.services.map_grid import MapGrid, check_map_code, utm_of, xy_of_lon_lat
+from amers.services.orthorectification.mapping import map_into_image, occluded_ground
+from amers.services.sensors.base import SensorModel
+from amers.services.terrain import Terrain
+from amers.services.types import Array, FloatImage, IntArray, Progress, no_progress
 
 MAX_READ_PIXELS = 24_000_000
 """Largest number of image pixels read at once, 96 MB; a window of the map that needs more is divided."""

@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from services.errors import InputError
-from services.geodesy import WGS84_A, longitudes_near
-from services.imagery.scene import Scene, scene_footprint, scene_gsd_m
-from services.map_grid import MapGrid
-from services.types import Array
+from amers.services.errors import InputError
+from amers.services.geodesy import WGS84_A, longitudes_near
+from amers.services.imagery.scene import Scene, scene_footprint, scene_gsd_m
+from amers.services.map_grid import MapGrid
+from amers.services.types import Array
 
 TILE_PX = 256
 MOST_ZOOM = 24

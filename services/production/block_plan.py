@@ -6,16 +6,16 @@ from functools import partial
 
 import numpy as np
 
-from services.adjustment.control_ground import ControlGround, joined_ground
-from services.adjustment.parameters import ImageParameters, image_parameters
-from services.adjustment.planning import planned_observations
-from services.errors import InputError
-from services.geodesy import continuous, lon_lat_h_from_east_north_up, metres_per_degree_at
-from services.map_grid import MapGrid, utm_of
-from services.sensors.base import SensorModel
-from services.sensors.ortho import OrthoModel, ReliefDisplacement
-from services.simulation.orbit import pushbroom_over
-from services.types import Array, BoolArray, Frame, IntArray, Observations
+from amers.services.adjustment.control_ground import ControlGround, joined_ground
+from amers.services.adjustment.parameters import ImageParameters, image_parameters
+from amers.services.adjustment.planning import planned_observations
+from amers.services.errors import InputError
+from amers.services.geodesy import continuous, lon_lat_h_from_east_north_up, metres_per_degree_at
+from amers.services.map_grid import MapGrid, utm_of
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.ortho import OrthoModel, ReliefDisplacement
+from amers.services.simulation.orbit import pushbroom_over
+from amers.services.types import Array, BoolArray, Frame, IntArray, Observations
 
 _HEIGHT_MARGIN_M = 1000.0
 _RADIUS = 0.1

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.adjustment.bundle import BlockAdjustment
-from services.conventions import MAX_ERROR_SIGMAS
-from services.imagery.scene import Scene, scene_centre, scene_gsd_m
-from services.sensors.base import SensorModel
-from services.types import Array, IntArray, Observations
+from amers.services.adjustment.bundle import BlockAdjustment
+from amers.services.conventions import MAX_ERROR_SIGMAS
+from amers.services.imagery.scene import Scene, scene_centre, scene_gsd_m
+from amers.services.sensors.base import SensorModel
+from amers.services.types import Array, IntArray, Observations
 
 FITS = "fits"
 _FEWEST = 12

@@ -5,21 +5,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.control_ground import ControlGround, joined_ground
-from services.adjustment.intersection import intersect
-from services.adjustment.known_images import KnownImages
-from services.imagery.scene import Scene
-from services.production.control_points import ControlBlock, find_control
-from services.production.height_control import (
+from amers.services.adjustment.control_ground import ControlGround, joined_ground
+from amers.services.adjustment.intersection import intersect
+from amers.services.adjustment.known_images import KnownImages
+from amers.services.imagery.scene import Scene
+from amers.services.production.control_points import ControlBlock, find_control
+from amers.services.production.height_control import (
     ControlHeights,
     known_heights,
     ortho_heights,
     surfaces_above,
 )
-from services.production.marked_control import MarkedGround, known_marks
-from services.production.ortho_control import ControlOrtho, known_on_ortho
-from services.tasks import Work
-from services.types import Array, Frame, Observations, Progress, joined_observations, part_of
+from amers.services.production.marked_control import MarkedGround, known_marks
+from amers.services.production.ortho_control import ControlOrtho, known_on_ortho
+from amers.services.tasks import Work
+from amers.services.types import Array, Frame, Observations, Progress, joined_observations, part_of
 
 
 @dataclass(frozen=True)

@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from services.adjustment.control_ground import ControlGround, joined_ground
-from services.conventions import MAX_ERROR_SIGMAS
-from services.errors import NotEnoughPoints
-from services.imagery.scene import Scene
-from services.imagery.source import CachedImage
-from services.matching.control_points import ChipSearch, MatchingOptions, match_points
-from services.matching.correlate import FOUND
-from services.matching.multi_image import chip_inside
-from services.tasks import Arrays, Work
-from services.types import (
+from amers.services.adjustment.control_ground import ControlGround, joined_ground
+from amers.services.conventions import MAX_ERROR_SIGMAS
+from amers.services.errors import NotEnoughPoints
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import CachedImage
+from amers.services.matching.control_points import ChipSearch, MatchingOptions, match_points
+from amers.services.matching.correlate import FOUND
+from amers.services.matching.multi_image import chip_inside
+from amers.services.tasks import Arrays, Work
+from amers.services.types import (
     ChipSource,
     ControlPoints,
     Frame,

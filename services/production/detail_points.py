@@ -4,13 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from services.imagery.scene import Scene
-from services.imagery.source import render_chip
-from services.matching.control_points import chip_pixels
-from services.matching.multi_image import chip_saliency, stored_chip
-from services.production.point_views import shows_nearly_whole_chip, views_at_levels
-from services.production.view_agreement import AgreedViews
-from services.types import Array, ControlPoints, Frame, IntArray
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import render_chip
+from amers.services.matching.control_points import chip_pixels
+from amers.services.matching.multi_image import chip_saliency, stored_chip
+from amers.services.production.point_views import shows_nearly_whole_chip, views_at_levels
+from amers.services.production.view_agreement import AgreedViews
+from amers.services.types import Array, ControlPoints, Frame, IntArray
 
 
 def detail_saliency(scene: Scene, lon_lat_h: Array, gsd_m: float) -> float:

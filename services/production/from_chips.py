@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.conventions import CHIP_CENTRE
-from services.errors import FormatError, NotEnoughPoints
-from services.geodesy import box_around
-from services.imagery.scene import Scene
-from services.imagery.source import image_gsd_m, render_chip
-from services.matching.multi_image import nearly_whole, stored_chip
-from services.production.detail_points import detail_saliency
-from services.production.from_points import (
+from amers.services.conventions import CHIP_CENTRE
+from amers.services.errors import FormatError, NotEnoughPoints
+from amers.services.geodesy import box_around
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import image_gsd_m, render_chip
+from amers.services.matching.multi_image import nearly_whole, stored_chip
+from amers.services.production.detail_points import detail_saliency
+from amers.services.production.from_points import (
     MIN_POINTS,
     MISSING,
     NO_HEIGHT,
@@ -25,7 +25,7 @@ from services.production.from_points import (
     check_sigmas,
     repeated_places,
 )
-from services.types import (
+from amers.services.types import (
     Acquisition,
     Array,
     ChipArray,

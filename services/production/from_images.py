@@ -6,30 +6,30 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from services.adjustment.block_problem import BlockOptions
-from services.adjustment.bundle import BlockAdjustment, adjust_block
-from services.adjustment.control_ground import NO_CONTROL, ControlGround, joined_ground
-from services.adjustment.intersection import intersect, residuals_and_derivatives
-from services.adjustment.known_images import KnownImages
-from services.adjustment.observation_noise import found_noise
-from services.adjustment.parameters import image_parameters
-from services.conventions import CHIP_SIZE
-from services.errors import InputError, NotEnoughPoints
-from services.geodesy import box_around, continuous, east_north_up
-from services.imagery.scene import Scene, scene_gsd_m
-from services.matching.ground_features import FeatureOptions
-from services.matching.multi_image import RefinementOptions, chip_inside
-from services.matching.predict import rank_in_group
-from services.production.block_residuals import ImageFit, PointFits, image_fits, point_fits
-from services.production.control import Control, MeasuredPoints, with_control
-from services.production.ground_parts import CutPoints, cut_points, measure_points
-from services.production.height_control import ortho_heights
-from services.production.image_passes import image_passes
-from services.production.point_views import check_image_names, shows_chip
-from services.production.tie_points import find_tie_points
-from services.quality.density import GroundMask
-from services.tasks import Effort, Work
-from services.types import (
+from amers.services.adjustment.block_problem import BlockOptions
+from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
+from amers.services.adjustment.control_ground import NO_CONTROL, ControlGround, joined_ground
+from amers.services.adjustment.intersection import intersect, residuals_and_derivatives
+from amers.services.adjustment.known_images import KnownImages
+from amers.services.adjustment.observation_noise import found_noise
+from amers.services.adjustment.parameters import image_parameters
+from amers.services.conventions import CHIP_SIZE
+from amers.services.errors import InputError, NotEnoughPoints
+from amers.services.geodesy import box_around, continuous, east_north_up
+from amers.services.imagery.scene import Scene, scene_gsd_m
+from amers.services.matching.ground_features import FeatureOptions
+from amers.services.matching.multi_image import RefinementOptions, chip_inside
+from amers.services.matching.predict import rank_in_group
+from amers.services.production.block_residuals import ImageFit, PointFits, image_fits, point_fits
+from amers.services.production.control import Control, MeasuredPoints, with_control
+from amers.services.production.ground_parts import CutPoints, cut_points, measure_points
+from amers.services.production.height_control import ortho_heights
+from amers.services.production.image_passes import image_passes
+from amers.services.production.point_views import check_image_names, shows_chip
+from amers.services.production.tie_points import find_tie_points
+from amers.services.quality.density import GroundMask
+from amers.services.tasks import Effort, Work
+from amers.services.types import (
     Array,
     BoolArray,
     ChipArray,

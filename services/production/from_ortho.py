@@ -8,17 +8,17 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from services.errors import InputError, NotEnoughPoints
-from services.geodesy import box_around
-from services.imagery.gaps import bridged, filled
-from services.imagery.scene import Scene, scene_centre, scene_gsd_m
-from services.imagery.source import Window, block_means
-from services.matching.multi_image import chip_inside
-from services.production.detail_points import detail_points, detail_saliency
-from services.production.point_views import check_image_names, chips_of
-from services.production.view_agreement import agreed_views
-from services.terrain import Terrain
-from services.types import (
+from amers.services.errors import InputError, NotEnoughPoints
+from amers.services.geodesy import box_around
+from amers.services.imagery.gaps import bridged, filled
+from amers.services.imagery.scene import Scene, scene_centre, scene_gsd_m
+from amers.services.imagery.source import Window, block_means
+from amers.services.matching.multi_image import chip_inside
+from amers.services.production.detail_points import detail_points, detail_saliency
+from amers.services.production.point_views import check_image_names, chips_of
+from amers.services.production.view_agreement import agreed_views
+from amers.services.terrain import Terrain
+from amers.services.types import (
     Array,
     ChipArray,
     ControlPoints,

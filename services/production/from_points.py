@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.errors import InputError, NotEnoughPoints
-from services.geodesy import box_around
-from services.imagery.scene import Scene, scene_gsd_m, view_direction
-from services.matching.multi_image import chip_inside
-from services.production.detail_points import detail_points, detail_saliency
-from services.production.point_views import check_image_names, chips_of
-from services.production.view_agreement import AgreedViews, agreed_views
-from services.types import (
+from amers.services.errors import InputError, NotEnoughPoints
+from amers.services.geodesy import box_around
+from amers.services.imagery.scene import Scene, scene_gsd_m, view_direction
+from amers.services.matching.multi_image import chip_inside
+from amers.services.production.detail_points import detail_points, detail_saliency
+from amers.services.production.point_views import check_image_names, chips_of
+from amers.services.production.view_agreement import AgreedViews, agreed_views
+from amers.services.types import (
     Array,
     BoolArray,
     ChipArray,

@@ -15,8 +15,8 @@ import numpy.typing as npt
 import shapely
 from numba import njit
 
-from services.quality.density import box_area_km2
-from services.types import Array, BoolArray, IntArray
+from amers.services.quality.density import box_area_km2
+from amers.services.types import Array, BoolArray, IntArray
 
 EARTH_RADIUS_M = 6_371_007.2
 """Radius of the sphere with the area of the ellipsoid."""

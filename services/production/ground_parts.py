@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import shapely
 
-from services.imagery.scene import Scene, scene_footprint
-from services.matching.multi_image import RefinementOptions, refine_on_chips
-from services.production.point_views import chips_of, point_views, surface_heights
-from services.tasks import Arrays, Work
-from services.types import (
+from amers.services.imagery.scene import Scene, scene_footprint
+from amers.services.matching.multi_image import RefinementOptions, refine_on_chips
+from amers.services.production.point_views import chips_of, point_views, surface_heights
+from amers.services.tasks import Arrays, Work
+from amers.services.types import (
     Array,
     ChipArray,
     IntArray,

@@ -7,19 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from services.adjustment.control_ground import ControlGround
-from services.errors import NotEnoughPoints
-from services.geodesy import move_metres
-from services.imagery.scene import Scene
-from services.matching.multi_image import seen_whole
-from services.matching.surface_heights import surface_height
-from services.production.ground_parts import image_parts
-from services.production.ortho_control import place_names
-from services.sensors.correction import CorrectedModel
-from services.sensors.ortho import OrthoModel
-from services.tasks import Arrays, Work
-from services.terrain import Terrain
-from services.types import Array, Frame, Observations, Progress, SurfaceHeights
+from amers.services.adjustment.control_ground import ControlGround
+from amers.services.errors import NotEnoughPoints
+from amers.services.geodesy import move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.matching.multi_image import seen_whole
+from amers.services.matching.surface_heights import surface_height
+from amers.services.production.ground_parts import image_parts
+from amers.services.production.ortho_control import place_names
+from amers.services.sensors.correction import CorrectedModel
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.tasks import Arrays, Work
+from amers.services.terrain import Terrain
+from amers.services.types import Array, Frame, Observations, Progress, SurfaceHeights
 
 _PER_SIDE = 7
 """Heights along each side of the square around a point."""

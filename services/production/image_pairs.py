@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 
-from services.geodesy import ecef_from_east_north_up
-from services.imagery.scene import Scene, scene_centre, scene_footprint
-from services.matching.predict import rank_in_group
-from services.types import Array, BoolArray, IntArray
+from amers.services.geodesy import ecef_from_east_north_up
+from amers.services.imagery.scene import Scene, scene_centre, scene_footprint
+from amers.services.matching.predict import rank_in_group
+from amers.services.types import Array, BoolArray, IntArray
 
 PARTNERS = 8
 """Images that every image is matched with, when as many overlap it."""

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from services.types import Acquisition, Array, BoolArray
+from amers.services.types import Acquisition, Array, BoolArray
 
 _LONGEST_PASS = timedelta(minutes=20)
 """A satellite sees a place for less than this from horizon to horizon, and next after a whole orbit."""

@@ -4,7 +4,7 @@ The input is what a catalogue states, no pixels. Ground is divided into cells; a
 clearly when the cell's centre lies inside its footprint and outside of its mask. Every cell needs
 `min_views` clear views by images below the first cloud limit. Where the catalogue has fewer, the next
 limit applies, and so on: a cloudier image counts only there, and only outside of its mask.
-`services.production.multi_cover` solves the problem that results, and bounds it.
+`amers.services.production.multi_cover` solves the problem that results, and bounds it.
 """
 
 from dataclasses import dataclass, replace
@@ -13,16 +13,16 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from services.errors import CoverageError, InputError
-from services.imagery.catalogue import ImageCatalogue, Shapes
-from services.production.ground_cells import (
+from amers.services.errors import CoverageError, InputError
+from amers.services.imagery.catalogue import ImageCatalogue, Shapes
+from amers.services.production.ground_cells import (
     EARTH_RADIUS_M,
     GroundGrid,
     SeenCells,
     ground_grid,
     seen_cells,
 )
-from services.production.multi_cover import (
+from amers.services.production.multi_cover import (
     Classes,
     Counts,
     CoverProblem,
@@ -31,7 +31,7 @@ from services.production.multi_cover import (
     lower_bound,
     without_excess,
 )
-from services.types import Array, BoolArray, IntArray, Progress, no_progress
+from amers.services.types import Array, BoolArray, IntArray, Progress, no_progress
 
 CELLS_ACROSS = 12.0
 """Cells along the side of a square footprint of median area."""

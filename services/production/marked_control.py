@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.adjustment.control_ground import ControlGround
-from services.types import Array, Frame, Observations
+from amers.services.adjustment.control_ground import ControlGround
+from amers.services.types import Array, Frame, Observations
 
 
 @dataclass(frozen=True)

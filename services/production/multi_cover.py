@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from services.types import Array, BoolArray, IntArray
+from amers.services.types import Array, BoolArray, IntArray
 
 Counts = npt.NDArray[np.int16]
 CellNumbers = npt.NDArray[np.int32]

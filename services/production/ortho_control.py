@@ -8,18 +8,23 @@ from typing import Any
 
 import numpy as np
 
-from services.adjustment.control_ground import ControlGround
-from services.conventions import CHIP_SIZE, MAX_ERROR_SIGMAS
-from services.errors import NotEnoughPoints
-from services.geodesy import move_metres
-from services.imagery.scene import Scene
-from services.imagery.source import image_gsd_m, render_chip
-from services.matching.correlate import FOUND, find_chip
-from services.matching.multi_image import RefinementOptions, chip_inside, reference_chip, seen_whole
-from services.matching.reference_image import Reference
-from services.production.ground_parts import image_parts
-from services.tasks import Arrays, Work
-from services.types import Array, BoolArray, Frame, Progress, no_progress
+from amers.services.adjustment.control_ground import ControlGround
+from amers.services.conventions import CHIP_SIZE, MAX_ERROR_SIGMAS
+from amers.services.errors import NotEnoughPoints
+from amers.services.geodesy import move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import image_gsd_m, render_chip
+from amers.services.matching.correlate import FOUND, find_chip
+from amers.services.matching.multi_image import (
+    RefinementOptions,
+    chip_inside,
+    reference_chip,
+    seen_whole,
+)
+from amers.services.matching.reference_image import Reference
+from amers.services.production.ground_parts import image_parts
+from amers.services.tasks import Arrays, Work
+from amers.services.types import Array, BoolArray, Frame, Progress, no_progress
 
 _SEARCH = RefinementOptions()
 _FIRST_REACH_PX = 60

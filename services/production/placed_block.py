@@ -5,15 +5,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.control_ground import ControlGround
-from services.adjustment.intersection import intersect
-from services.errors import NotEnoughPoints
-from services.geodesy import move_metres
-from services.imagery.scene import Scene
-from services.production.control import Control, MeasuredPoints, with_control
-from services.sensors.rpc import RpcModel
-from services.tasks import Work
-from services.types import Array, ControlPoints, IntArray, Observations, Progress, no_progress
+from amers.services.adjustment.control_ground import ControlGround
+from amers.services.adjustment.intersection import intersect
+from amers.services.errors import NotEnoughPoints
+from amers.services.geodesy import move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.production.control import Control, MeasuredPoints, with_control
+from amers.services.sensors.rpc import RpcModel
+from amers.services.tasks import Work
+from amers.services.types import Array, ControlPoints, IntArray, Observations, Progress, no_progress
 
 _FEWEST = 3
 _POINT_SIGMA_PX = 0.1

@@ -5,16 +5,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.adjustment.planning import PredictedBlock, predicted_block
-from services.production.block_plan import (
+from amers.services.adjustment.planning import PredictedBlock, predicted_block
+from amers.services.production.block_plan import (
     BlockPlan,
     PlanGeometry,
     PlannedSite,
     observed_and_known,
     plan_geometry,
 )
-from services.quality.normal_law import LINEAR_LE90, normal_ce90
-from services.types import Array, IntArray, Progress, no_progress
+from amers.services.quality.normal_law import LINEAR_LE90, normal_ce90
+from amers.services.types import Array, IntArray, Progress, no_progress
 
 
 @dataclass(frozen=True)

@@ -4,12 +4,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from services.errors import InputError
-from services.imagery.scene import Scene, view_direction
-from services.imagery.source import render_chip
-from services.matching.multi_image import chip_inside, nearly_whole, stored_chip
-from services.matching.surface_heights import surface_height
-from services.types import (
+from amers.services.errors import InputError
+from amers.services.imagery.scene import Scene, view_direction
+from amers.services.imagery.source import render_chip
+from amers.services.matching.multi_image import chip_inside, nearly_whole, stored_chip
+from amers.services.matching.surface_heights import surface_height
+from amers.services.types import (
     Array,
     BoolArray,
     ChipArray,

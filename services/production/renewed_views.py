@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.block_accuracy import positive_part
-from services.imagery.scene import Scene, scene_gsd_m
-from services.production.new_points import NewPoints
-from services.production.point_views import chips_of, shows_nearly_whole_chip, views_at_levels
-from services.types import (
+from amers.services.adjustment.block_accuracy import positive_part
+from amers.services.imagery.scene import Scene, scene_gsd_m
+from amers.services.production.new_points import NewPoints
+from amers.services.production.point_views import chips_of, shows_nearly_whole_chip, views_at_levels
+from amers.services.types import (
     Array,
     ChipArray,
     ChipSource,

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from services.imagery.scene import Scene, scene_gsd_m
-from services.matching.ground_features import FeatureOptions, Features, find_features
-from services.matching.tie_points import Matches, match_features
-from services.matching.tracks import image_cells, spread_tracks, tracks
-from services.production.image_pairs import image_pairs
-from services.tasks import Arrays, Work
-from services.types import BoolArray, Observations, Progress, part_of
+from amers.services.imagery.scene import Scene, scene_gsd_m
+from amers.services.matching.ground_features import FeatureOptions, Features, find_features
+from amers.services.matching.tie_points import Matches, match_features
+from amers.services.matching.tracks import image_cells, spread_tracks, tracks
+from amers.services.production.image_pairs import image_pairs
+from amers.services.tasks import Arrays, Work
+from amers.services.types import BoolArray, Observations, Progress, part_of
 
 _CELLS_A_SIDE = 16
 _PER_CELL = 8

@@ -6,18 +6,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.conventions import CHIP_SIZE
-from services.errors import NotEnoughPoints
-from services.geodesy import move_metres
-from services.imagery.scene import Scene
-from services.imagery.source import render_chip
-from services.matching.correlate import FOUND, find_chip
-from services.matching.multi_image import RefinementOptions, chip_inside, nearly_whole
-from services.sensors.base import SensorModel
-from services.sensors.correction import CorrectedModel, fold_into_rpc, no_correction
-from services.sensors.ortho import OrthoModel, fold_into_ortho
-from services.sensors.rpc import RpcModel
-from services.types import Array, BoolArray, IntArray, Observations, Progress, no_progress
+from amers.services.conventions import CHIP_SIZE
+from amers.services.errors import NotEnoughPoints
+from amers.services.geodesy import move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import render_chip
+from amers.services.matching.correlate import FOUND, find_chip
+from amers.services.matching.multi_image import RefinementOptions, chip_inside, nearly_whole
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.correction import CorrectedModel, fold_into_rpc, no_correction
+from amers.services.sensors.ortho import OrthoModel, fold_into_ortho
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Array, BoolArray, IntArray, Observations, Progress, no_progress
 
 _SEARCH = RefinementOptions()
 """How the chip of one image is searched in another one."""

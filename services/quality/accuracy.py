@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import bdtr, gammaincinv
 
-from services.types import Array, IntArray
+from amers.services.types import Array, IntArray
 
 MIN_CHECK_POINTS = 30
 """Smallest number of check points by ASPRS (Positional Accuracy Standards, edition 2)."""

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from services.quality.frames import frame_le90_m, why_unknown
-from services.quality.normal_law import LINEAR_LE90, normal_ce90
-from services.types import Array, Frame
+from amers.services.quality.frames import frame_le90_m, why_unknown
+from amers.services.quality.normal_law import LINEAR_LE90, normal_ce90
+from amers.services.types import Array, Frame
 
 RELATIVE = "Relative to the control points"
 ON_THE_EARTH = "On the Earth"

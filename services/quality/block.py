@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from services.quality.accuracy_statement import AccuracyStatement, median_accuracy
-from services.quality.density import DensityCells, density_cells, share_reaching
-from services.types import Array, ControlPoints, Frame, IntArray
+from amers.services.quality.accuracy_statement import AccuracyStatement, median_accuracy
+from amers.services.quality.density import DensityCells, density_cells, share_reaching
+from amers.services.types import Array, ControlPoints, Frame, IntArray
 
 HALF_PER_KM2 = 0.5
 QUARTER_PER_KM2 = 0.25

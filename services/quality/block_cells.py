@@ -5,14 +5,14 @@ from datetime import datetime
 
 import numpy as np
 
-from services.quality.density import (
+from amers.services.quality.density import (
     DensityCells,
     GroundMask,
     cell_of_points,
     covered_area_km2,
     density_cells,
 )
-from services.types import Array, ControlPoints, IntArray
+from amers.services.types import Array, ControlPoints, IntArray
 
 _DAYS_OF_A_YEAR = 365.25
 _SMALLEST_KM2 = 1e-4

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from services.quality.accuracy import (
+from amers.services.quality.accuracy import (
     NormalisedError,
     Quantile,
     effective_number,
@@ -14,10 +14,10 @@ from services.quality.accuracy import (
     sample_quantile,
     statistics,
 )
-from services.quality.density import GroundMask
-from services.quality.normal_law import LINEAR_LE90
-from services.terrain import Terrain
-from services.types import Array, ControlPoints, IntArray
+from amers.services.quality.density import GroundMask
+from amers.services.quality.normal_law import LINEAR_LE90
+from amers.services.terrain import Terrain
+from amers.services.types import Array, ControlPoints, IntArray
 
 Compared = Literal["surface", "point"]
 """The height of the surface at a point, or that of the point, which is that of its chip's content."""

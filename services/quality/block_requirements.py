@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from services.quality.accuracy import MIN_CHECK_POINTS, Quantile
-from services.quality.block_cells import BlockCells
-from services.quality.block_heights import HeightQuality
-from services.quality.planimetry import CHECK_ONLY, CONTROL, PlanimetricQuality, SiteGroup
+from amers.services.quality.accuracy import MIN_CHECK_POINTS, Quantile
+from amers.services.quality.block_cells import BlockCells
+from amers.services.quality.block_heights import HeightQuality
+from amers.services.quality.planimetry import CHECK_ONLY, CONTROL, PlanimetricQuality, SiteGroup
 
 Outcome = Literal["met", "not shown", "missed"]
 BlockVerdict = Literal["met", "not shown", "missed", "not specified"]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.quality.stability import (
+from amers.services.quality.stability import (
     AdjustedScene,
     Displacement,
     GroupMeans,
@@ -16,7 +16,7 @@ from services.quality.stability import (
     residuals_in_image,
     what_repetitions_show,
 )
-from services.types import IntArray, Measures
+from amers.services.types import IntArray, Measures
 
 CELLS = 4
 """Cells along each side of the area of the active points."""

@@ -4,15 +4,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.image_correction import SceneAdjustment
-from services.errors import CoverageError
-from services.geodesy import metres_per_degree_at
-from services.quality.accuracy import Accuracy, NormalisedError, accuracy, normalised_error
-from services.quality.criteria import at_most, verdict_of
-from services.quality.qualification import Qualification
-from services.quality.stability import ImageResiduals, residuals_in_image
-from services.sensors.base import SensorModel
-from services.types import Array, Frame
+from amers.services.adjustment.image_correction import SceneAdjustment
+from amers.services.errors import CoverageError
+from amers.services.geodesy import metres_per_degree_at
+from amers.services.quality.accuracy import Accuracy, NormalisedError, accuracy, normalised_error
+from amers.services.quality.criteria import at_most, verdict_of
+from amers.services.quality.qualification import Qualification
+from amers.services.quality.stability import ImageResiduals, residuals_in_image
+from amers.services.sensors.base import SensorModel
+from amers.services.types import Array, Frame
 
 MARKING_SIGMA_PX = 0.5
 """Precision with which a person marks a detail in an image, one standard deviation a coordinate, where

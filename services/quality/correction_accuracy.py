@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from services.quality.frames import frame_in_image
-from services.sensors.correction import ImageCorrection
-from services.types import Array, Frame
+from amers.services.quality.frames import frame_in_image
+from amers.services.sensors.correction import ImageCorrection
+from amers.services.types import Array, Frame
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from services.geodesy import WGS84_B, WGS84_E2
-from services.types import Array, BoolArray, IntArray
+from amers.services.geodesy import WGS84_B, WGS84_E2
+from amers.services.types import Array, BoolArray, IntArray
 
 CELLS_PER_DEGREE = 10
 _SAMPLES_PER_SIDE = 64

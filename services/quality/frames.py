@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from services.quality.normal_law import LINEAR_LE90
-from services.types import Array, BoolArray, ControlPoints, Frame
+from amers.services.quality.normal_law import LINEAR_LE90
+from amers.services.types import Array, BoolArray, ControlPoints, Frame
 
 
 def shared_frame(points: ControlPoints, active: BoolArray) -> Frame:

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.matching.chip_shears import ChipShears
-from services.quality.criteria import Criterion, at_most
-from services.types import Array, BoolArray, IntArray
+from amers.services.matching.chip_shears import ChipShears
+from amers.services.quality.criteria import Criterion, at_most
+from amers.services.types import Array, BoolArray, IntArray
 
 _UNKNOWNS = 6
 """The direction, and the linear distortion of the image."""

@@ -8,7 +8,7 @@ of place, these are lost. What hides points hides them here and there.
 import numpy as np
 from scipy.special import bdtr
 
-from services.types import Array, BoolArray, IntArray
+from amers.services.types import Array, BoolArray, IntArray
 
 UNFOUND = ("low_score", "ambiguous", "border_peak", "views_disagree")
 """Why points are not found that the scene may show elsewhere: neither clouds nor missing pixels."""

@@ -6,7 +6,7 @@ from statistics import NormalDist
 
 import numpy as np
 
-from services.types import Array
+from amers.services.types import Array
 
 CIRCULAR_CE90 = float(np.sqrt(2.0 * np.log(10.0)))
 """CE90 of a circular normal law of unit sigma (2.1460)."""

@@ -6,10 +6,10 @@ from typing import Literal
 
 import numpy as np
 
-from services.quality.accuracy import Accuracy, NormalisedError, accuracy, normalised_error
-from services.quality.normal_law import normal_ce90
-from services.quality.site_errors import POINTS, SiteErrors
-from services.types import Array, Frame, IntArray
+from amers.services.quality.accuracy import Accuracy, NormalisedError, accuracy, normalised_error
+from amers.services.quality.normal_law import normal_ce90
+from amers.services.quality.site_errors import POINTS, SiteErrors
+from amers.services.types import Array, Frame, IntArray
 
 Source = Literal["points", "images"]
 CHECK_ONLY, CONTROL = "check-only sites", "control sites"

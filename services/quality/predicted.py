@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.quality.frames import frame_in_image
-from services.quality.normal_law import normal_ce90, overall_ce90
-from services.quality.stability import AdjustedScene
-from services.types import Array
+from amers.services.quality.frames import frame_in_image
+from amers.services.quality.normal_law import normal_ce90, overall_ce90
+from amers.services.quality.stability import AdjustedScene
+from amers.services.types import Array
 
 
 @dataclass(frozen=True)

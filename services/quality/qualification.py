@@ -5,15 +5,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import KDTree
 
-from services.adjustment.broken_image import on_one_side
-from services.conventions import CHIP_SIZE
-from services.matching.consensus import a_contrario_consensus, consensus_tolerance_px
-from services.quality.accuracy import Statistics, statistics
-from services.quality.accuracy_statement import AccuracyStatement, scene_accuracy
-from services.quality.cell_stability import CellStability, measure_cell_stability
-from services.quality.criteria import Criterion, Verdict, at_least, at_most, verdict_of
-from services.quality.frames import why_unknown
-from services.quality.lack_of_fit import (
+from amers.services.adjustment.broken_image import on_one_side
+from amers.services.conventions import CHIP_SIZE
+from amers.services.matching.consensus import a_contrario_consensus, consensus_tolerance_px
+from amers.services.quality.accuracy import Statistics, statistics
+from amers.services.quality.accuracy_statement import AccuracyStatement, scene_accuracy
+from amers.services.quality.cell_stability import CellStability, measure_cell_stability
+from amers.services.quality.criteria import Criterion, Verdict, at_least, at_most, verdict_of
+from amers.services.quality.frames import why_unknown
+from amers.services.quality.lack_of_fit import (
     against_height,
     breaks_criterion,
     correction_against_height,
@@ -21,16 +21,16 @@ from services.quality.lack_of_fit import (
     missed_criterion,
     structure_criteria,
 )
-from services.quality.line_of_sight import implied_sight, line_of_sight_criterion
-from services.quality.predicted import PredictedAccuracy, predict_accuracy
-from services.quality.stability import (
+from amers.services.quality.line_of_sight import implied_sight, line_of_sight_criterion
+from amers.services.quality.predicted import PredictedAccuracy, predict_accuracy
+from amers.services.quality.stability import (
     AdjustedScene,
     ImageResiduals,
     Stability,
     measure_stability,
     residuals_in_image,
 )
-from services.types import Array, BoolArray, Frame, Measures
+from amers.services.types import Array, BoolArray, Frame, Measures
 
 _ENOUGH_RESIDUALS = 6
 """Active points whose residuals tell a standard deviation."""

@@ -5,13 +5,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.conventions import MAX_ERROR_SIGMAS
-from services.geodesy import move_metres
-from services.imagery.source import image_gsds_m
-from services.matching.control_points import ChipSearch, MatchingOptions, match_points
-from services.matching.predict import in_image
-from services.matching.reference_image import Reference
-from services.types import Acquisition, Array, ChipSource, ControlPoints, IntArray, Progress, no_progress
+from amers.services.conventions import MAX_ERROR_SIGMAS
+from amers.services.geodesy import move_metres
+from amers.services.imagery.source import image_gsds_m
+from amers.services.matching.control_points import ChipSearch, MatchingOptions, match_points
+from amers.services.matching.predict import in_image
+from amers.services.matching.reference_image import Reference
+from amers.services.types import (
+    Acquisition,
+    Array,
+    ChipSource,
+    ControlPoints,
+    IntArray,
+    Progress,
+    no_progress,
+)
 
 POINTS = "points"
 UNKNOWN_FRAME_SIGMA_M = 10.0

@@ -6,13 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from services.imagery.scene import Scene, view_direction
-from services.imagery.source import image_gsd_m
-from services.matching.predict import in_image
-from services.matching.reference_image import ReferenceMatchingOptions, match_places, visible_places
-from services.quality.site_errors import Site, SiteErrors, frame_of_site_m2, reasons_of
-from services.terrain import Terrain
-from services.types import Array, Progress, no_progress
+from amers.services.imagery.scene import Scene, view_direction
+from amers.services.imagery.source import image_gsd_m
+from amers.services.matching.predict import in_image
+from amers.services.matching.reference_image import (
+    ReferenceMatchingOptions,
+    match_places,
+    visible_places,
+)
+from amers.services.quality.site_errors import Site, SiteErrors, frame_of_site_m2, reasons_of
+from amers.services.terrain import Terrain
+from amers.services.types import Array, Progress, no_progress
 
 _PLACES = 225
 """Places of a site that are compared with one image."""

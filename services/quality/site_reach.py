@@ -5,14 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.adjustment.block_problem import BlockOptions
-from services.adjustment.bundle import BlockAdjustment, adjust_block
-from services.adjustment.control_ground import NO_CONTROL, ControlGround, joined_ground
-from services.adjustment.parameters import AdjustableImage
-from services.errors import InputError
-from services.geodesy import ecef_from_lon_lat_h, metres_per_degree_at, wrapped_degrees
-from services.quality.stability import image_places
-from services.types import Array, Observations
+from amers.services.adjustment.block_problem import BlockOptions
+from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
+from amers.services.adjustment.control_ground import NO_CONTROL, ControlGround, joined_ground
+from amers.services.adjustment.parameters import AdjustableImage
+from amers.services.errors import InputError
+from amers.services.geodesy import ecef_from_lon_lat_h, metres_per_degree_at, wrapped_degrees
+from amers.services.quality.stability import image_places
+from amers.services.types import Array, Observations
 
 
 @dataclass(frozen=True)

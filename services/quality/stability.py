@@ -5,13 +5,13 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from services.adjustment.image_correction import SceneAdjustment
-from services.errors import ComputationError
-from services.matching.chip_shears import ChipShears
-from services.quality.accuracy import Statistics, statistics
-from services.quality.lack_of_fit import Elsewhere
-from services.sensors.base import SensorModel
-from services.types import Array, BoolArray, Frame, IntArray, Measures
+from amers.services.adjustment.image_correction import SceneAdjustment
+from amers.services.errors import ComputationError
+from amers.services.matching.chip_shears import ChipShears
+from amers.services.quality.accuracy import Statistics, statistics
+from amers.services.quality.lack_of_fit import Elsewhere
+from amers.services.sensors.base import SensorModel
+from amers.services.types import Array, BoolArray, Frame, IntArray, Measures
 
 PLACES = ("top left", "top right", "bottom right", "bottom left", "centre")
 

@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from services.geodesy import continuous, east_north_up
-from services.types import Array, BoolArray, IntArray, health
+from amers.services.geodesy import continuous, east_north_up
+from amers.services.types import Array, BoolArray, IntArray, health
 
 Days = npt.NDArray[np.datetime64]
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from services.imagery.scene import Scene
-from services.matching.height_consensus import view_consensus
-from services.registration.context import SearchStage
-from services.registration.search import FIRST_TOLERANCE_PX, next_step, sees_nothing
-from services.types import Array
+from amers.services.imagery.scene import Scene
+from amers.services.matching.height_consensus import view_consensus
+from amers.services.registration.context import SearchStage
+from amers.services.registration.search import FIRST_TOLERANCE_PX, next_step, sees_nothing
+from amers.services.types import Array
 
 _MAX_FALSE_ALARMS = 1e-4
 _MORE = 1.25

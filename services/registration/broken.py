@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from services.errors import BrokenImage, NoConsensus, NotEnoughPoints
-from services.imagery.line_breaks import format_breaks, scene_breaks
-from services.imagery.scene import Scene
+from amers.services.errors import BrokenImage, NoConsensus, NotEnoughPoints
+from amers.services.imagery.line_breaks import format_breaks, scene_breaks
+from amers.services.imagery.scene import Scene
 
 
 @contextmanager

@@ -3,10 +3,10 @@
 import numpy as np
 from scipy.special import ndtr
 
-from services.conventions import CHIP_CENTRE
-from services.imagery.scene import Scene, scene_gsd_m
-from services.registration.context import Prediction
-from services.types import Array, BoolArray, ControlPoints
+from amers.services.conventions import CHIP_CENTRE
+from amers.services.imagery.scene import Scene, scene_gsd_m
+from amers.services.registration.context import Prediction
+from amers.services.types import Array, BoolArray, ControlPoints
 
 _MAX_CHIP_TO_SCENE = 1.25
 """Chips other than the finest may be this many times coarser than the scene."""

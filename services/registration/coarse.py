@@ -10,18 +10,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.conventions import CHIP_CENTRE, CHIP_SIZE, MAX_ERROR_SIGMAS
-from services.imagery.scene import Scene, scene_gsd_m
-from services.imagery.source import ImageSource, ReducedImage, reduce_image
-from services.matching.consensus import Consensus, Voters
-from services.matching.control_points import ChipSearch, match_points
-from services.matching.correlate import PeakThresholds
-from services.registration.another_view import another_view
-from services.registration.chip_selection import has_chip, visibility_probability
-from services.registration.context import PointContext, Prediction, SearchStage
-from services.registration.far import search_far
-from services.registration.point_selection import points_expected
-from services.registration.search import (
+from amers.services.conventions import CHIP_CENTRE, CHIP_SIZE, MAX_ERROR_SIGMAS
+from amers.services.imagery.scene import Scene, scene_gsd_m
+from amers.services.imagery.source import ImageSource, ReducedImage, reduce_image
+from amers.services.matching.consensus import Consensus, Voters
+from amers.services.matching.control_points import ChipSearch, match_points
+from amers.services.matching.correlate import PeakThresholds
+from amers.services.registration.another_view import another_view
+from amers.services.registration.chip_selection import has_chip, visibility_probability
+from amers.services.registration.context import PointContext, Prediction, SearchStage
+from amers.services.registration.far import search_far
+from amers.services.registration.point_selection import points_expected
+from amers.services.registration.search import (
     Search,
     adjust_search,
     check_consensus,
@@ -31,7 +31,7 @@ from services.registration.search import (
     search_radius_px,
     summarise,
 )
-from services.types import IntArray
+from amers.services.types import IntArray
 
 _TRIES = 2
 """Searches of which one has to agree, and the better one is the last of the summaries: two tries are

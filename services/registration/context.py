@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
-from services.imagery.scene import Scene, scene_gsd_m
-from services.imagery.source import CachedImage
-from services.registration.options import RegistrationOptions
-from services.sensors.correction import CorrectedModel
-from services.types import Array, ChipSource, ControlPoints, IntArray, Progress, part_of
+from amers.services.imagery.scene import Scene, scene_gsd_m
+from amers.services.imagery.source import CachedImage
+from amers.services.registration.options import RegistrationOptions
+from amers.services.sensors.correction import CorrectedModel
+from amers.services.types import Array, ChipSource, ControlPoints, IntArray, Progress, part_of
 
 
 @dataclass(frozen=True)

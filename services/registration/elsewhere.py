@@ -8,34 +8,34 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.image_correction import SceneAdjustment
-from services.conventions import CHIP_SIZE
-from services.matching.consensus import (
+from amers.services.adjustment.image_correction import SceneAdjustment
+from amers.services.conventions import CHIP_SIZE
+from amers.services.matching.consensus import (
     Consensus,
     Voters,
     a_contrario_consensus,
     consensus_tolerance_px,
 )
-from services.matching.control_points import (
+from amers.services.matching.control_points import (
     ChipSearch,
     MatchingOptions,
     PointMatches,
     match_points,
     with_matches,
 )
-from services.matching.height_consensus import height_consensus
-from services.matching.predict import spread_over_image
-from services.quality.lack_of_fit import Elsewhere, are_contiguous, chance_of_contiguous
-from services.quality.missed_along import UNFOUND
-from services.registration.context import PointContext, Prediction
-from services.registration.search import (
+from amers.services.matching.height_consensus import height_consensus
+from amers.services.matching.predict import spread_over_image
+from amers.services.quality.lack_of_fit import Elsewhere, are_contiguous, chance_of_contiguous
+from amers.services.quality.missed_along import UNFOUND
+from amers.services.registration.context import PointContext, Prediction
+from amers.services.registration.search import (
     FIRST_TOLERANCE_PX,
     Search,
     adjust_search,
     predict,
     select_inliers,
 )
-from services.types import Array, BoolArray, IntArray
+from amers.services.types import Array, BoolArray, IntArray
 
 _FEWEST = 5
 """Points that were not found, from which on they are searched again."""

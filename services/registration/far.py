@@ -7,34 +7,34 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from services.conventions import CHIP_CENTRE, CHIP_SIZE
-from services.geodesy import east_north_up, lon_lat_h_from_east_north_up
-from services.imagery.gaps import filled
-from services.imagery.scene import Scene, scene_centre, scene_gsd_m
-from services.imagery.source import low_pass, sample_image
-from services.matching.consensus import Consensus
-from services.matching.control_points import chip_pixels
-from services.matching.multi_image import nearly_whole
-from services.matching.radiometry import gradient_image
-from services.matching.view_selection import select_views
-from services.registration.another_view import another_view
-from services.registration.context import (
+from amers.services.conventions import CHIP_CENTRE, CHIP_SIZE
+from amers.services.geodesy import east_north_up, lon_lat_h_from_east_north_up
+from amers.services.imagery.gaps import filled
+from amers.services.imagery.scene import Scene, scene_centre, scene_gsd_m
+from amers.services.imagery.source import low_pass, sample_image
+from amers.services.matching.consensus import Consensus
+from amers.services.matching.control_points import chip_pixels
+from amers.services.matching.multi_image import nearly_whole
+from amers.services.matching.radiometry import gradient_image
+from amers.services.matching.view_selection import select_views
+from amers.services.registration.another_view import another_view
+from amers.services.registration.context import (
     Candidate,
     NotFound,
     Prediction,
     RegistrationContext,
     SearchStage,
 )
-from services.registration.point_selection import points_expected
-from services.registration.search import (
+from amers.services.registration.point_selection import points_expected
+from amers.services.registration.search import (
     FIRST_TOLERANCE_PX,
     check_consensus,
     first_consensus,
     largest_error_m,
 )
-from services.sensors.base import SensorModel
-from services.sensors.correction import CorrectedModel, no_correction
-from services.types import (
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.correction import CorrectedModel, no_correction
+from amers.services.types import (
     Array,
     BoolArray,
     ChipSource,

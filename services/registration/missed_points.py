@@ -9,12 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from services.adjustment.image_correction import SceneAdjustment
-from services.matching.control_points import ChipSearch, match_points, with_matches
-from services.quality.missed_along import UNFOUND, missed_along
-from services.registration.context import PointContext, Prediction
-from services.registration.search import Search, adjust_search, select_inliers
-from services.types import IntArray
+from amers.services.adjustment.image_correction import SceneAdjustment
+from amers.services.matching.control_points import ChipSearch, match_points, with_matches
+from amers.services.quality.missed_along import UNFOUND, missed_along
+from amers.services.registration.context import PointContext, Prediction
+from amers.services.registration.search import Search, adjust_search, select_inliers
+from amers.services.types import IntArray
 
 _RADIUS_PX = 128
 """Search radius, pixels of the chips."""

@@ -4,29 +4,40 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.image_correction import SceneAdjustment
-from services.conventions import CHIP_SIZE
-from services.errors import ComputationError, CoverageError, NoConsensus, NotEnoughPoints, TurnedImage
-from services.imagery.line_breaks import scene_breaks
-from services.imagery.scene import Scene
-from services.imagery.source import CachedImage
-from services.matching.consensus import Voters
-from services.matching.control_points import ChipSearch, match_points
-from services.quality.frames import shared_frame
-from services.quality.lack_of_fit import Elsewhere
-from services.quality.qualification import Qualification, qualify
-from services.quality.stability import AdjustedScene
-from services.registration.another_view import another_view
-from services.registration.broken import naming_breaks
-from services.registration.chip_selection import fine_gsd_m
-from services.registration.coarse import needs_coarse_search, search_coarsely
-from services.registration.context import PointContext, Prediction, RegistrationContext, SearchStage
-from services.registration.elsewhere import adjust_with_places
-from services.registration.missed_points import search_missed_points
-from services.registration.options import RegistrationOptions
-from services.registration.point_results import point_results
-from services.registration.point_selection import initial_prediction, points_to_try, visible_points
-from services.registration.search import (
+from amers.services.adjustment.image_correction import SceneAdjustment
+from amers.services.conventions import CHIP_SIZE
+from amers.services.errors import (
+    ComputationError,
+    CoverageError,
+    NoConsensus,
+    NotEnoughPoints,
+    TurnedImage,
+)
+from amers.services.imagery.line_breaks import scene_breaks
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import CachedImage
+from amers.services.matching.consensus import Voters
+from amers.services.matching.control_points import ChipSearch, match_points
+from amers.services.quality.frames import shared_frame
+from amers.services.quality.lack_of_fit import Elsewhere
+from amers.services.quality.qualification import Qualification, qualify
+from amers.services.quality.stability import AdjustedScene
+from amers.services.registration.another_view import another_view
+from amers.services.registration.broken import naming_breaks
+from amers.services.registration.chip_selection import fine_gsd_m
+from amers.services.registration.coarse import needs_coarse_search, search_coarsely
+from amers.services.registration.context import (
+    PointContext,
+    Prediction,
+    RegistrationContext,
+    SearchStage,
+)
+from amers.services.registration.elsewhere import adjust_with_places
+from amers.services.registration.missed_points import search_missed_points
+from amers.services.registration.options import RegistrationOptions
+from amers.services.registration.point_results import point_results
+from amers.services.registration.point_selection import initial_prediction, points_to_try, visible_points
+from amers.services.registration.search import (
     Search,
     adjust_search,
     check_inliers,
@@ -37,10 +48,10 @@ from services.registration.search import (
     shears_of_active,
     summarise,
 )
-from services.registration.turned import turned_scenes
-from services.sensors.base import SensorModel
-from services.sensors.correction import CorrectedModel
-from services.types import (
+from amers.services.registration.turned import turned_scenes
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.correction import CorrectedModel
+from amers.services.types import (
     BoolArray,
     ChipSource,
     ControlPoints,

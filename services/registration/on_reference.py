@@ -4,37 +4,42 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.image_correction import SceneAdjustment
-from services.conventions import CHIP_SIZE, MAX_ERROR_SIGMAS
-from services.errors import ComputationError, CoverageError, NoConsensus
-from services.imagery.line_breaks import scene_breaks
-from services.imagery.scene import Scene, scene_centre, scene_gsd_m
-from services.imagery.source import (
+from amers.services.adjustment.image_correction import SceneAdjustment
+from amers.services.conventions import CHIP_SIZE, MAX_ERROR_SIGMAS
+from amers.services.errors import ComputationError, CoverageError, NoConsensus
+from amers.services.imagery.line_breaks import scene_breaks
+from amers.services.imagery.scene import Scene, scene_centre, scene_gsd_m
+from amers.services.imagery.source import (
     CachedImage,
     ImageSource,
     ReducedImage,
     image_gsds_m,
     reduce_image,
 )
-from services.matching.consensus import Voters
-from services.matching.predict import in_image
-from services.matching.reference_image import (
+from amers.services.matching.consensus import Voters
+from amers.services.matching.predict import in_image
+from amers.services.matching.reference_image import (
     Places,
     Reference,
     locate_on_terrain,
     match_places,
     visible_places,
 )
-from services.quality.stability import image_places
-from services.registration.broken import naming_breaks
-from services.registration.context import PointContext, Prediction, RegistrationContext, SearchStage
-from services.registration.elsewhere import adjust_with_places
-from services.registration.far import search_far
-from services.registration.on_points import Registration, build_registration
-from services.registration.options import RegistrationOptions
-from services.registration.point_selection import initial_prediction
-from services.registration.reference_points import ReferenceChips, reference_points
-from services.registration.search import (
+from amers.services.quality.stability import image_places
+from amers.services.registration.broken import naming_breaks
+from amers.services.registration.context import (
+    PointContext,
+    Prediction,
+    RegistrationContext,
+    SearchStage,
+)
+from amers.services.registration.elsewhere import adjust_with_places
+from amers.services.registration.far import search_far
+from amers.services.registration.on_points import Registration, build_registration
+from amers.services.registration.options import RegistrationOptions
+from amers.services.registration.point_selection import initial_prediction
+from amers.services.registration.reference_points import ReferenceChips, reference_points
+from amers.services.registration.search import (
     Search,
     adjust_search,
     check_consensus,
@@ -46,8 +51,8 @@ from services.registration.search import (
     select_inliers,
     summarise,
 )
-from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
-from services.types import Array, Progress, no_progress
+from amers.services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
+from amers.services.types import Array, Progress, no_progress
 
 _FAR = 0.25
 """Largest error, over the smaller side of a scene, at which places within the scene are enough."""

@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass, field
 
-from services.adjustment.image_correction import AdjustmentOptions
-from services.errors import InputError
-from services.matching.control_points import MatchingOptions
-from services.matching.reference_image import ReferenceMatchingOptions
-from services.quality.qualification import QualificationOptions
+from amers.services.adjustment.image_correction import AdjustmentOptions
+from amers.services.errors import InputError
+from amers.services.matching.control_points import MatchingOptions
+from amers.services.matching.reference_image import ReferenceMatchingOptions
+from amers.services.quality.qualification import QualificationOptions
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from services.adjustment.image_correction import SceneAdjustment
-from services.imagery.scene import Scene
-from services.registration.search import Search
-from services.sensors.correction import CorrectedModel
-from services.types import Array, ControlPoints, Measures
+from amers.services.adjustment.image_correction import SceneAdjustment
+from amers.services.imagery.scene import Scene
+from amers.services.registration.search import Search
+from amers.services.sensors.correction import CorrectedModel
+from amers.services.types import Array, ControlPoints, Measures
 
 
 def point_results(

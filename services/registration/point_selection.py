@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from services.conventions import MAX_ERROR_SIGMAS
-from services.errors import CoverageError
-from services.imagery.scene import Scene, scene_gsd_m
-from services.matching.chip_extent import MIN_VISIBLE_SIDE
-from services.matching.predict import in_image, spread_over_image
-from services.registration.chip_selection import has_chip, visibility_probability
-from services.registration.context import Prediction
-from services.sensors.correction import CorrectedModel, no_correction
-from services.types import Array, ControlPoints, IntArray
+from amers.services.conventions import MAX_ERROR_SIGMAS
+from amers.services.errors import CoverageError
+from amers.services.imagery.scene import Scene, scene_gsd_m
+from amers.services.matching.chip_extent import MIN_VISIBLE_SIDE
+from amers.services.matching.predict import in_image, spread_over_image
+from amers.services.registration.chip_selection import has_chip, visibility_probability
+from amers.services.registration.context import Prediction
+from amers.services.sensors.correction import CorrectedModel, no_correction
+from amers.services.types import Array, ControlPoints, IntArray
 
 MIN_RELATIVE_PROBABILITY = 0.5
 """Points whose probability of being shown is below this fraction of the best point's are tried only

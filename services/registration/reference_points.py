@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.imagery.source import image_gsd_m, image_gsds_m, render_chip
-from services.matching.reference_image import Reference
-from services.types import Acquisition, Array, ChipArray, ControlPoints, Views
+from amers.services.imagery.source import image_gsd_m, image_gsds_m, render_chip
+from amers.services.matching.reference_image import Reference
+from amers.services.types import Acquisition, Array, ChipArray, ControlPoints, Views
 
 
 def reference_points(

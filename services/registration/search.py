@@ -7,29 +7,29 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.control_observations import ControlObservations
-from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
-from services.conventions import MAX_ERROR_SIGMAS
-from services.errors import NoConsensus, NotEnoughPoints
-from services.geodesy import continuous, ecef_from_east_north_up
-from services.imagery.scene import Scene, scene_centre, scene_gsd_m
-from services.imagery.source import image_gsds_m
-from services.matching.chip_shears import ChipShears
-from services.matching.consensus import (
+from amers.services.adjustment.control_observations import ControlObservations
+from amers.services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
+from amers.services.conventions import MAX_ERROR_SIGMAS
+from amers.services.errors import NoConsensus, NotEnoughPoints
+from amers.services.geodesy import continuous, ecef_from_east_north_up
+from amers.services.imagery.scene import Scene, scene_centre, scene_gsd_m
+from amers.services.imagery.source import image_gsds_m
+from amers.services.matching.chip_shears import ChipShears
+from amers.services.matching.consensus import (
     Consensus,
     Voters,
     a_contrario_consensus,
     consensus_tolerance_px,
     robust_affine_inliers,
 )
-from services.matching.control_points import PointMatches
-from services.quality.frames import shared_frame
-from services.registration.context import Candidate, NotFound, Prediction, SearchStage
-from services.sensors.base import SensorModel
-from services.sensors.correction import CorrectedModel
-from services.sensors.displacement import DisplacementGrid
-from services.sensors.ortho import OrthoModel
-from services.types import Array, BoolArray, ControlPoints, IntArray
+from amers.services.matching.control_points import PointMatches
+from amers.services.quality.frames import shared_frame
+from amers.services.registration.context import Candidate, NotFound, Prediction, SearchStage
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.correction import CorrectedModel
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Array, BoolArray, ControlPoints, IntArray
 
 FIRST_TOLERANCE_PX = 3.0
 """Displacements of a first search agree within this many pixels of the chips that are searched."""

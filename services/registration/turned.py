@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from services.imagery.scene import Scene
-from services.sensors.correction import CorrectedModel, no_correction
+from amers.services.imagery.scene import Scene
+from amers.services.sensors.correction import CorrectedModel, no_correction
 
 _TURNS = {
     "mirrored: its samples run the other way": (1, -1, False),

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from services.production.block_residuals import FITS, ImageFit, PointFits
-from services.production.from_images import Production
-from services.quality.accuracy_statement import AccuracyStatement, accuracy_document
-from services.quality.block import produced_accuracy
-from services.types import Array
+from amers.services.production.block_residuals import FITS, ImageFit, PointFits
+from amers.services.production.from_images import Production
+from amers.services.quality.accuracy_statement import AccuracyStatement, accuracy_document
+from amers.services.quality.block import produced_accuracy
+from amers.services.types import Array
 
 FORMAT = "amers-adjustment/1"
 ALL_FITS, LOOK_AT = "all fits", "look at"

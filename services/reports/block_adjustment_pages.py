@@ -7,15 +7,15 @@ from markupsafe import Markup
 from rich.markup import escape
 from rich.table import Table
 
-from services.conventions import MAX_ERROR_SIGMAS
-from services.geodesy import east_north_up
-from services.production.block_residuals import FITS, ImageFit
-from services.reports.block_adjustment import ALL_FITS, AdjustmentReport
-from services.reports.drawing import ACTIVE, DEACTIVATED, crowding
-from services.reports.html import page_template
-from services.reports.maps import equal_panel
-from services.reports.plot import QUIET, SMALL_TEXT, Figure
-from services.types import Array
+from amers.services.conventions import MAX_ERROR_SIGMAS
+from amers.services.geodesy import east_north_up
+from amers.services.production.block_residuals import FITS, ImageFit
+from amers.services.reports.block_adjustment import ALL_FITS, AdjustmentReport
+from amers.services.reports.drawing import ACTIVE, DEACTIVATED, crowding
+from amers.services.reports.html import page_template
+from amers.services.reports.maps import equal_panel
+from amers.services.reports.plot import QUIET, SMALL_TEXT, Figure
+from amers.services.types import Array
 
 _HEIGHT = 300.0
 _LEGEND_ROW = 16.0

@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from services.quality.accuracy_statement import StatedAccuracy
-from services.quality.block import (
+from amers.services.quality.accuracy_statement import StatedAccuracy
+from amers.services.quality.block import (
     HALF_PER_KM2,
     QUARTER_PER_KM2,
     Distribution,
@@ -16,9 +16,9 @@ from services.quality.block import (
     distribution,
     produced_accuracy,
 )
-from services.quality.block_cells import BlockCells, images_per_point, view_ages_years
-from services.quality.block_heights import HeightErrors, HeightQuality
-from services.quality.block_requirements import (
+from amers.services.quality.block_cells import BlockCells, images_per_point, view_ages_years
+from amers.services.quality.block_heights import HeightErrors, HeightQuality
+from amers.services.quality.block_requirements import (
     VERDICT_WORDS,
     BlockCriterion,
     BlockRequirements,
@@ -28,11 +28,11 @@ from services.quality.block_requirements import (
     block_verdict,
     outcome_of,
 )
-from services.quality.density import share_reaching
-from services.quality.planimetry import PlanimetricQuality
-from services.quality.site_errors import SiteErrors
-from services.reports.report import NOT_IN_JSON
-from services.types import Array, ControlPoints
+from amers.services.quality.density import share_reaching
+from amers.services.quality.planimetry import PlanimetricQuality
+from amers.services.quality.site_errors import SiteErrors
+from amers.services.reports.report import NOT_IN_JSON
+from amers.services.types import Array, ControlPoints
 
 BLOCK_QUALITY_FORMAT = "amers-block-quality/1"
 

@@ -4,13 +4,22 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from services.geodesy import metres_per_degree
-from services.quality.block import HALF_PER_KM2, QUARTER_PER_KM2
-from services.reports.block_quality import BlockQualityReport
-from services.reports.drawing import ACTIVE, DEACTIVATED, crowding, round_number
-from services.reports.maps import equal_panel
-from services.reports.plot import INK, QUIET, SMALL_TEXT, WIDTH, Figure, Panel, left_margin, widened
-from services.types import Array, IntArray
+from amers.services.geodesy import metres_per_degree
+from amers.services.quality.block import HALF_PER_KM2, QUARTER_PER_KM2
+from amers.services.reports.block_quality import BlockQualityReport
+from amers.services.reports.drawing import ACTIVE, DEACTIVATED, crowding, round_number
+from amers.services.reports.maps import equal_panel
+from amers.services.reports.plot import (
+    INK,
+    QUIET,
+    SMALL_TEXT,
+    WIDTH,
+    Figure,
+    Panel,
+    left_margin,
+    widened,
+)
+from amers.services.types import Array, IntArray
 
 _LEGEND = 20.0
 _TALLEST = 300.0

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from markupsafe import Markup
 from rich.table import Table
 
-from services.quality.accuracy import NormalisedError
-from services.quality.block_requirements import BlockCriterion, BlockVerdict
-from services.reports.block_quality import BlockQualityReport, CellQuality, degree_words
-from services.reports.block_quality_figures import (
+from amers.services.quality.accuracy import NormalisedError
+from amers.services.quality.block_requirements import BlockCriterion, BlockVerdict
+from amers.services.reports.block_quality import BlockQualityReport, CellQuality, degree_words
+from amers.services.reports.block_quality_figures import (
     density_map,
     error_scatter,
     height_histogram,
@@ -16,8 +16,8 @@ from services.reports.block_quality_figures import (
     site_map,
     views_map,
 )
-from services.reports.html import page_template
-from services.reports.numbers import ABSENT, number, percent, quantile
+from amers.services.reports.html import page_template
+from amers.services.reports.numbers import ABSENT, number, percent, quantile
 
 TONES: dict[BlockVerdict, str] = {"met": "good", "missed": "failed"}
 MOST_CELLS = 200

@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from services.adjustment.affine_fit import Order
-from services.adjustment.displacement_components import BENDS, Component
-from services.adjustment.image_correction import SceneAdjustment
-from services.imagery.scene import Scene, scene_footprint, scene_gsd_m
-from services.quality.criteria import VERDICT_EXPLANATIONS, verdict_scope
-from services.registration.on_points import Registration
-from services.registration.options import RegistrationOptions
-from services.reports.figure_data import FigureData
-from services.reports.reasons import count_reasons
-from services.reports.report import (
+from amers.services.adjustment.affine_fit import Order
+from amers.services.adjustment.displacement_components import BENDS, Component
+from amers.services.adjustment.image_correction import SceneAdjustment
+from amers.services.imagery.scene import Scene, scene_footprint, scene_gsd_m
+from amers.services.quality.criteria import VERDICT_EXPLANATIONS, verdict_scope
+from amers.services.registration.on_points import Registration
+from amers.services.registration.options import RegistrationOptions
+from amers.services.reports.figure_data import FigureData
+from amers.services.reports.reasons import count_reasons
+from amers.services.reports.report import (
     REPORT_FORMAT,
     Check,
     CorrectionRecord,
@@ -23,7 +23,7 @@ from services.reports.report import (
     RunRecord,
     SceneRecord,
 )
-from services.sensors.ortho import OrthoModel
+from amers.services.sensors.ortho import OrthoModel
 
 
 def build_report(

@@ -2,16 +2,16 @@
 
 import numpy as np
 
-from services.quality.accuracy import statistics
-from services.reports.drawing import (
+from amers.services.quality.accuracy import statistics
+from amers.services.reports.drawing import (
     ACTIVE,
     DEACTIVATED,
     MATCHED,
     NOT_MATCHED,
     shortened,
 )
-from services.reports.numbers import number
-from services.reports.plot import (
+from amers.services.reports.numbers import number
+from amers.services.reports.plot import (
     INK,
     QUIET,
     SMALL_TEXT,
@@ -23,8 +23,8 @@ from services.reports.plot import (
     left_margin,
     widened,
 )
-from services.reports.report import RegistrationReport
-from services.types import Array
+from amers.services.reports.report import RegistrationReport
+from amers.services.types import Array
 
 _GAP = 14.0
 """Width between panels, points."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.quality.criteria import Criterion
-from services.reports.numbers import ABSENT, criterion_limit, criterion_value
+from amers.services.quality.criteria import Criterion
+from amers.services.reports.numbers import ABSENT, criterion_limit, criterion_value
 
 NOT_USABLE = "not usable"
 

@@ -14,11 +14,11 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from services.docstrings import attribute_descriptions
-from services.reports.block_quality import BLOCK_QUALITY_FORMAT, BlockQualityReport
-from services.reports.failure import FAILURE_FORMAT, FailureReport
-from services.reports.joint import JOINT_FORMAT, JointReport
-from services.reports.report import NOT_IN_JSON, REPORT_FORMAT, RegistrationReport
+from amers.services.docstrings import attribute_descriptions
+from amers.services.reports.block_quality import BLOCK_QUALITY_FORMAT, BlockQualityReport
+from amers.services.reports.failure import FAILURE_FORMAT, FailureReport
+from amers.services.reports.joint import JOINT_FORMAT, JointReport
+from amers.services.reports.report import NOT_IN_JSON, REPORT_FORMAT, RegistrationReport
 
 Report = RegistrationReport | FailureReport | BlockQualityReport | JointReport
 Json = None | bool | int | float | str | list[Any] | dict[str, Any]

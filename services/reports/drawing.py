@@ -3,11 +3,11 @@
 import cv2
 import numpy as np
 
-from services.conventions import STATUS_COLOURS
-from services.reports.figure_data import Quicklook
-from services.reports.plot import WIDTH, Figure, Panel
-from services.reports.report import RegistrationReport
-from services.types import Array, BoolArray, FloatImage
+from amers.services.conventions import STATUS_COLOURS
+from amers.services.reports.figure_data import Quicklook
+from amers.services.reports.plot import WIDTH, Figure, Panel
+from amers.services.reports.report import RegistrationReport
+from amers.services.types import Array, BoolArray, FloatImage
 
 ACTIVE, DEACTIVATED, NOT_MATCHED = STATUS_COLOURS.values()
 MATCHED = "#8db7ea"

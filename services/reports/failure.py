@@ -4,14 +4,14 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from services.conventions import MAX_ERROR_SIGMAS
-from services.errors import BrokenImage, CoverageError, NoConsensus, NotEnoughPoints, TurnedImage
-from services.quality.accuracy_statement import AccuracyStatement, StatedAccuracy, no_accuracy
-from services.registration.context import SearchStage
-from services.registration.search import larger_sigma_m
-from services.reports.numbers import number
-from services.reports.report import NOT_IN_JSON, RunRecord, SceneRecord
-from services.types import Array
+from amers.services.conventions import MAX_ERROR_SIGMAS
+from amers.services.errors import BrokenImage, CoverageError, NoConsensus, NotEnoughPoints, TurnedImage
+from amers.services.quality.accuracy_statement import AccuracyStatement, StatedAccuracy, no_accuracy
+from amers.services.registration.context import SearchStage
+from amers.services.registration.search import larger_sigma_m
+from amers.services.reports.numbers import number
+from amers.services.reports.report import NOT_IN_JSON, RunRecord, SceneRecord
+from amers.services.types import Array
 
 FAILURE_FORMAT = "amers-registration-failure/1"
 NOT_REGISTERED: Literal["not registered"] = "not registered"

@@ -8,16 +8,16 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from services.geodesy import metres_per_degree
-from services.reports.drawing import ACTIVE, DEACTIVATED, NOT_MATCHED
-from services.reports.failure import FailureReport, significance_words
-from services.reports.html import centre_words, flat_options, page_template
-from services.reports.maps import equal_panel
-from services.reports.numbers import number
-from services.reports.plot import Figure
-from services.reports.reasons import reason_label
-from services.reports.report import SceneRecord
-from services.types import Array
+from amers.services.geodesy import metres_per_degree
+from amers.services.reports.drawing import ACTIVE, DEACTIVATED, NOT_MATCHED
+from amers.services.reports.failure import FailureReport, significance_words
+from amers.services.reports.html import centre_words, flat_options, page_template
+from amers.services.reports.maps import equal_panel
+from amers.services.reports.numbers import number
+from amers.services.reports.plot import Figure
+from amers.services.reports.reasons import reason_label
+from amers.services.reports.report import SceneRecord
+from amers.services.types import Array
 
 _WIDTH = 100
 

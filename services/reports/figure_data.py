@@ -5,12 +5,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.adjustment.image_correction import SceneAdjustment
-from services.imagery.scene import Scene
-from services.imagery.source import reduce_image, render_chip
-from services.registration.on_points import Registration
-from services.sensors.displacement import DisplacementGrid
-from services.types import Array, ChipArray, ChipSource, ControlPoints, FloatImage, Measures, point_chips
+from amers.services.adjustment.image_correction import SceneAdjustment
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import reduce_image, render_chip
+from amers.services.registration.on_points import Registration
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.types import (
+    Array,
+    ChipArray,
+    ChipSource,
+    ControlPoints,
+    FloatImage,
+    Measures,
+    point_chips,
+)
 
 QUICKLOOK_PX = 1200
 COMPARED_EACH = 6

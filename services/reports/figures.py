@@ -2,16 +2,16 @@
 
 from collections.abc import Callable
 
-from services.reports.charts import (
+from amers.services.reports.charts import (
     displacement,
     funnel,
     residual_histograms,
     residuals_along,
     residuals_by_height,
 )
-from services.reports.maps import coverage_map, ground_overview, predicted_map, residual_map
-from services.reports.plot import Figure
-from services.reports.report import RegistrationReport
+from amers.services.reports.maps import coverage_map, ground_overview, predicted_map, residual_map
+from amers.services.reports.plot import Figure
+from amers.services.reports.report import RegistrationReport
 
 FIGURES: tuple[Callable[[RegistrationReport], Figure], ...] = (
     ground_overview,

@@ -11,10 +11,10 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
-from services.reports.criteria_rows import criterion_rows, unmet_criteria
-from services.reports.figure_data import ChipComparison
-from services.reports.figures import FIGURES, figure_markup
-from services.reports.numbers import (
+from amers.services.reports.criteria_rows import criterion_rows, unmet_criteria
+from amers.services.reports.figure_data import ChipComparison
+from amers.services.reports.figures import FIGURES, figure_markup
+from amers.services.reports.numbers import (
     ABSENT,
     criterion_limit,
     criterion_value,
@@ -23,11 +23,15 @@ from services.reports.numbers import (
     percent,
     quantile,
 )
-from services.reports.published import published_tables
-from services.reports.reasons import reason_label
-from services.reports.report import RegistrationReport
-from services.reports.stability_words import CELLS_EXPLANATION, cells_left_out_text, group_means_text
-from services.types import Array, ChipArray
+from amers.services.reports.published import published_tables
+from amers.services.reports.reasons import reason_label
+from amers.services.reports.report import RegistrationReport
+from amers.services.reports.stability_words import (
+    CELLS_EXPLANATION,
+    cells_left_out_text,
+    group_means_text,
+)
+from amers.services.types import Array, ChipArray
 
 COMPARED_PER_GROUP = 4
 
@@ -64,7 +68,7 @@ def format_html(report: RegistrationReport) -> str:
 def page_template(name: str) -> Template:
     """A compiled template of a page; it escapes all values and raises an error for unknown names."""
     environment = Environment(
-        loader=PackageLoader("services.reports", "."),
+        loader=PackageLoader("amers.services.reports", "."),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

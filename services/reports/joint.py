@@ -7,23 +7,23 @@ from typing import Literal
 
 import numpy as np
 
-from services.adjustment.parameter_figures import ParameterFigure
-from services.joint.registration import JointRegistration
-from services.joint.results import RigorousScene, ground_misfits_m
-from services.quality.accuracy import Statistics, statistics
-from services.quality.accuracy_statement import StatedAccuracy
-from services.quality.criteria import Verdict
-from services.quality.qualification import PointCounts
-from services.quality.stability import ImageResiduals, Stability
-from services.reports.published import (
+from amers.services.adjustment.parameter_figures import ParameterFigure
+from amers.services.joint.registration import JointRegistration
+from amers.services.joint.results import RigorousScene, ground_misfits_m
+from amers.services.quality.accuracy import Statistics, statistics
+from amers.services.quality.accuracy_statement import StatedAccuracy
+from amers.services.quality.criteria import Verdict
+from amers.services.quality.qualification import PointCounts
+from amers.services.quality.stability import ImageResiduals, Stability
+from amers.services.reports.published import (
     GROUND_COLUMNS,
     GROUND_WORDS,
     PublishedTable,
     published_tables,
 )
-from services.reports.report import NOT_IN_JSON, BlockUsed, RegistrationReport
-from services.sensors.moving_pushbroom import AttitudeMotion
-from services.types import Array
+from amers.services.reports.report import NOT_IN_JSON, BlockUsed, RegistrationReport
+from amers.services.sensors.moving_pushbroom import AttitudeMotion
+from amers.services.types import Array
 
 JOINT_FORMAT = "amers-joint-registration/1"
 

@@ -9,13 +9,13 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from services.geodesy import metres_per_degree
-from services.reports.drawing import ACTIVE, DEACTIVATED, crowding
-from services.reports.html import page_template
-from services.reports.joint import BlockTable, JointReport, JointScene, block_tables
-from services.reports.maps import equal_panel
-from services.reports.numbers import ABSENT, number
-from services.reports.plot import Figure
+from amers.services.geodesy import metres_per_degree
+from amers.services.reports.drawing import ACTIVE, DEACTIVATED, crowding
+from amers.services.reports.html import page_template
+from amers.services.reports.joint import BlockTable, JointReport, JointScene, block_tables
+from amers.services.reports.maps import equal_panel
+from amers.services.reports.numbers import ABSENT, number
+from amers.services.reports.plot import Figure
 
 _HEIGHT = 300.0
 _WIDTH = 160

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from services.geodesy import metres_per_degree
-from services.reports.drawing import (
+from amers.services.geodesy import metres_per_degree
+from amers.services.reports.drawing import (
     ACTIVE,
     ARROW,
     DEACTIVATED,
@@ -13,7 +13,7 @@ from services.reports.drawing import (
     round_number,
     shortened,
 )
-from services.reports.plot import (
+from amers.services.reports.plot import (
     MARKS,
     SMALL_TEXT,
     WIDTH,
@@ -22,10 +22,10 @@ from services.reports.plot import (
     left_margin,
     widened,
 )
-from services.reports.reasons import NO_REASON
-from services.reports.report import RegistrationReport
-from services.sensors.correction import ImageCorrection
-from services.types import Array, BoolArray
+from amers.services.reports.reasons import NO_REASON
+from amers.services.reports.report import RegistrationReport
+from amers.services.sensors.correction import ImageCorrection
+from amers.services.types import Array, BoolArray
 
 _ON_IMAGE = "#c9ced4"
 """Colour of points that are not matched, on the dark quicklook."""

@@ -1,7 +1,7 @@
 """Numbers as text for people."""
 
-from services.quality.accuracy import Quantile
-from services.quality.criteria import Criterion
+from amers.services.quality.accuracy import Quantile
+from amers.services.quality.criteria import Criterion
 
 ABSENT = "–"  # noqa: RUF001
 

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from services.reports.html import page_template
+from amers.services.reports.html import page_template
 
 
 @dataclass(frozen=True)

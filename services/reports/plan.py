@@ -4,8 +4,8 @@ from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any
 
-from services.production.block_plan import BlockPlan
-from services.production.planning import Accuracy90, Forecast
+from amers.services.production.block_plan import BlockPlan
+from amers.services.production.planning import Accuracy90, Forecast
 
 FORMAT = "amers-plan/1"
 VERDICT = "predicted"

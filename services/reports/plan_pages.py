@@ -4,12 +4,12 @@ import numpy as np
 from markupsafe import Markup
 from rich.table import Table
 
-from services.geodesy import metres_per_degree, wrapped_degrees
-from services.reports.html import page_template
-from services.reports.maps import equal_panel
-from services.reports.plan import PlanReport, accuracy_words
-from services.reports.plot import INK, SMALL_TEXT, Figure, Panel
-from services.types import Array
+from amers.services.geodesy import metres_per_degree, wrapped_degrees
+from amers.services.reports.html import page_template
+from amers.services.reports.maps import equal_panel
+from amers.services.reports.plan import PlanReport, accuracy_words
+from amers.services.reports.plot import INK, SMALL_TEXT, Figure, Panel
+from amers.services.types import Array
 
 _COLOURS = ("#2166ac", "#67a9cf", "#d1e5f0", "#fddbc7", "#ef8a62", "#b2182b")
 _PROPOSED, _SITE = "#b3372f", "#1b7837"

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from services.types import Array
+from amers.services.types import Array
 
 INK, QUIET = "var(--ink)", "var(--quiet)"
 """Colours that the style sheet of the page sets, so that figures follow its light or dark scheme."""

@@ -7,7 +7,7 @@ Source: Space Reference Points on Africa (2021): tables 2 and 4 (equipment, here
 import math
 from dataclasses import dataclass
 
-from services.reports.report import RegistrationReport
+from amers.services.reports.report import RegistrationReport
 
 ABSENT = math.nan
 GROUND_WORDS = ("Mean east", "Mean north", "Std east", "Std north", "Mean up", "Std up")

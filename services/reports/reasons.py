@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from services.types import Measures
+from amers.services.types import Measures
 
 Stage = Literal["not matched", "deactivated"]
 

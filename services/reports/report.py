@@ -10,18 +10,18 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Literal
 
-from services.quality.accuracy import Accuracy, NormalisedError
-from services.quality.accuracy_statement import AccuracyStatement, StatedAccuracy
-from services.quality.cell_stability import CellStability
-from services.quality.criteria import Criterion, Verdict
-from services.quality.predicted import PredictedAccuracy
-from services.quality.qualification import Coverage, GroundResiduals, PointCounts
-from services.quality.stability import ImageResiduals, Stability
-from services.registration.context import SearchStage
-from services.registration.options import RegistrationOptions
-from services.reports.figure_data import FigureData
-from services.reports.reasons import ReasonCount
-from services.types import Acquisition, Array
+from amers.services.quality.accuracy import Accuracy, NormalisedError
+from amers.services.quality.accuracy_statement import AccuracyStatement, StatedAccuracy
+from amers.services.quality.cell_stability import CellStability
+from amers.services.quality.criteria import Criterion, Verdict
+from amers.services.quality.predicted import PredictedAccuracy
+from amers.services.quality.qualification import Coverage, GroundResiduals, PointCounts
+from amers.services.quality.stability import ImageResiduals, Stability
+from amers.services.registration.context import SearchStage
+from amers.services.registration.options import RegistrationOptions
+from amers.services.reports.figure_data import FigureData
+from amers.services.reports.reasons import ReasonCount
+from amers.services.types import Acquisition, Array
 
 REPORT_FORMAT = "amers-registration-report/4"
 NOT_IN_JSON = {"json": False}

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from services.imagery.catalogue import ImageCatalogue
-from services.production.image_selection import ImageSelection, ImageUse, SelectionOptions
+from amers.services.imagery.catalogue import ImageCatalogue
+from amers.services.production.image_selection import ImageSelection, ImageUse, SelectionOptions
 
 FORMAT = "amers-selection/1"
 COMPLETE, RELAXED, SHORT = "complete", "relaxed", "short"

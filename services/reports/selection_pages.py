@@ -5,17 +5,17 @@ import numpy.typing as npt
 from markupsafe import Markup
 from rich.table import Table
 
-from services.production.image_selection import CellViews, ImageSelection
-from services.reports.html import page_template
-from services.reports.plot import SMALL_TEXT, WIDTH, Figure, Panel
-from services.reports.selection import (
+from amers.services.production.image_selection import CellViews, ImageSelection
+from amers.services.reports.html import page_template
+from amers.services.reports.plot import SMALL_TEXT, WIDTH, Figure, Panel
+from amers.services.reports.selection import (
     COMPLETE,
     RELAXED,
     SelectionReport,
     share_words,
     views_words,
 )
-from services.types import Array
+from amers.services.types import Array
 
 _TONES = {COMPLETE: "good", RELAXED: "usable"}
 _REACHED = "#7fb2e5"

@@ -1,8 +1,8 @@
 """What hold-outs show, in words: the same in every report."""
 
-from services.quality.cell_stability import CellStability
-from services.quality.stability import GroupMeans
-from services.reports.numbers import number
+from amers.services.quality.cell_stability import CellStability
+from amers.services.quality.stability import GroupMeans
+from amers.services.reports.numbers import number
 
 CELLS_EXPLANATION = (
     "Points held out at random leave their neighbours in, so that an error which neighbours share stays "

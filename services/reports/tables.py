@@ -8,11 +8,22 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from services.quality.accuracy import Statistics
-from services.quality.stability import Displacement
-from services.reports.numbers import ABSENT, criterion_limit, criterion_value, number, percent, quantile
-from services.reports.report import Check, RegistrationReport
-from services.reports.stability_words import CELLS_EXPLANATION, cells_left_out_text, group_means_text
+from amers.services.quality.accuracy import Statistics
+from amers.services.quality.stability import Displacement
+from amers.services.reports.numbers import (
+    ABSENT,
+    criterion_limit,
+    criterion_value,
+    number,
+    percent,
+    quantile,
+)
+from amers.services.reports.report import Check, RegistrationReport
+from amers.services.reports.stability_words import (
+    CELLS_EXPLANATION,
+    cells_left_out_text,
+    group_means_text,
+)
 
 _WIDTH = 100
 

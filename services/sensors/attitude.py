@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from services.sensors.piecewise import PiecewisePolynomial, from_function, lagrange
-from services.types import Array
+from amers.services.sensors.piecewise import PiecewisePolynomial, from_function, lagrange
+from amers.services.types import Array
 
 _DEGREE = 7
 _QUADRATIC = 2

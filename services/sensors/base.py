@@ -2,7 +2,7 @@
 
 from typing import Protocol
 
-from services.types import Array
+from amers.services.types import Array
 
 
 class SensorModel(Protocol):

@@ -4,10 +4,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.sensors.base import SensorModel
-from services.sensors.displacement import DisplacementGrid
-from services.sensors.rpc import RpcModel
-from services.types import Array
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Array
 
 _MOST_ITERATIONS = 40
 _INVERTED_PX = 1e-9

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numba import njit
 
-from services.types import Array, IntArray
+from amers.services.types import Array, IntArray
 
 _BESIDE_PX = 1.0
 """Distance from a break at which its displacement is that of one side."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from numba import njit
 
-from services.geodesy import WGS84_A, WGS84_B
+from amers.services.geodesy import WGS84_A, WGS84_B
 
 SPEED_OF_LIGHT_M_S = 299792458.0
 EARTH_ROTATION_RAD_S = 7.292115e-5

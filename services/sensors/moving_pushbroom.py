@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.sensors.attitude import turned_over_time
-from services.sensors.correction import ImageCorrection
-from services.sensors.piecewise import PiecewisePolynomial, from_function
-from services.sensors.pushbroom import PushbroomModel, used_times
-from services.sensors.pushbroom_errors import TERMS, PushbroomErrors
-from services.types import Array
+from amers.services.sensors.attitude import turned_over_time
+from amers.services.sensors.correction import ImageCorrection
+from amers.services.sensors.piecewise import PiecewisePolynomial, from_function
+from amers.services.sensors.pushbroom import PushbroomModel, used_times
+from amers.services.sensors.pushbroom_errors import TERMS, PushbroomErrors
+from amers.services.types import Array
 
 _SLOPES = 0.5, 2.0
 """Lines that are scanned for a line of the model without motion: what turns and bends do, and lines that

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.geodesy import ecef_from_lon_lat_h, move_metres
-from services.map_grid import MapGrid
-from services.sensors.correction import ImageCorrection
-from services.types import Array
+from amers.services.geodesy import ecef_from_lon_lat_h, move_metres
+from amers.services.map_grid import MapGrid
+from amers.services.sensors.correction import ImageCorrection
+from amers.services.types import Array
 
 LAND_M = (-430.0, 8850.0)
 """Lowest and highest land of the Earth, metres."""

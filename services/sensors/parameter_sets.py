@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from services.errors import InputError
+from amers.services.errors import InputError
 
 UNITS = ("μrad",) * 6 + ("m",) * 6 + ("ppm",) * 2
 """In which people state the terms of a rigorous model, in the order of `pushbroom_errors.TERMS`."""

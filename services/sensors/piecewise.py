@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from services.types import Array
+from amers.services.types import Array
 
 LAGRANGE_NODES = 8
 """Samples in an interpolation by a polynomial of degree seven."""

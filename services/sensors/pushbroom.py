@@ -6,17 +6,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from services.errors import FormatError
-from services.sensors import pushbroom_kernels as kernels
-from services.sensors.light_path import (
+from amers.services.errors import FormatError
+from amers.services.sensors import pushbroom_kernels as kernels
+from amers.services.sensors.light_path import (
     EARTH_ROTATION_RAD_S,
     GEOMETRIC,
     SPEED_OF_LIGHT_M_S,
     LightPath,
 )
-from services.sensors.piecewise import PiecewisePolynomial, tabulate
-from services.sensors.rpc import VALIDITY, cubic_terms
-from services.types import Array
+from amers.services.sensors.piecewise import PiecewisePolynomial, tabulate
+from amers.services.sensors.rpc import VALIDITY, cubic_terms
+from amers.services.types import Array
 
 TERRAIN_M = (-500.0, 9000.0)
 """Heights of all ground on the Earth, above the ellipsoid: rigorous models hold everywhere."""

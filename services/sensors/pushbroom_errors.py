@@ -5,11 +5,11 @@ from functools import cached_property
 
 import numpy as np
 
-from services.geodesy import ecef_from_east_north_up
-from services.sensors.attitude import TURNS
-from services.sensors.piecewise import PiecewisePolynomial
-from services.sensors.pushbroom import PushbroomModel
-from services.types import Array
+from amers.services.geodesy import ecef_from_east_north_up
+from amers.services.sensors.attitude import TURNS
+from amers.services.sensors.piecewise import PiecewisePolynomial
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.types import Array
 
 TERMS = (
     "roll",

@@ -1,4 +1,4 @@
-"""Compiled computations of the pushbroom model; `services.sensors.pushbroom` explains them."""
+"""Compiled computations of the pushbroom model; `amers.services.sensors.pushbroom` explains them."""
 
 import math
 from typing import NamedTuple
@@ -6,21 +6,21 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from services.geodesy import WGS84_A, WGS84_B, WGS84_E2
-from services.sensors.light_path import (
+from amers.services.geodesy import WGS84_A, WGS84_B, WGS84_E2
+from amers.services.sensors.light_path import (
     EARTH_ROTATION_RAD_S,
     height_and_vertical,
     zenith_path_excess_m,
 )
-from services.sensors.piecewise import (
+from amers.services.sensors.piecewise import (
     Pieces,
     half_width,
     horner,
     horner_with_slope,
     piece_at,
 )
-from services.sensors.rpc import VALIDITY, cubic
-from services.types import Array
+from amers.services.sensors.rpc import VALIDITY, cubic
+from amers.services.types import Array
 
 _PROJECT_TOLERANCE_PX = 1e-3
 """The last secant step; its own error is a thousand times smaller, or more."""

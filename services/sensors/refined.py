@@ -3,11 +3,11 @@
 import math
 from dataclasses import dataclass
 
-from services.errors import CoverageError
-from services.sensors.base import SensorModel
-from services.sensors.correction import CorrectedModel, fold_into_rpc, folds_into_rpc
-from services.sensors.rpc import RpcModel
-from services.sensors.rpc_fit import fit_rpc
+from amers.services.errors import CoverageError
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.correction import CorrectedModel, fold_into_rpc, folds_into_rpc
+from amers.services.sensors.rpc import RpcModel
+from amers.services.sensors.rpc_fit import fit_rpc
 
 REFIT_LIMIT_PX = 0.01
 """Largest difference, anywhere in the image, of a refitted RPC from the corrected model."""

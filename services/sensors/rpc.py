@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from services.errors import FormatError
-from services.geodesy import ecef_from_lon_lat_h, metres_per_degree
-from services.types import Array
+from amers.services.errors import FormatError
+from amers.services.geodesy import ecef_from_lon_lat_h, metres_per_degree
+from amers.services.types import Array
 
 VALIDITY = 2.0
 """Largest normalised ground coordinate: a model is used up to twice the range on which it was fitted.

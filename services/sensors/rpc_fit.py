@@ -4,11 +4,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.errors import CoverageError
-from services.geodesy import longitudes_near
-from services.sensors.base import SensorModel
-from services.sensors.rpc import RpcModel, cubic_terms
-from services.types import Array
+from amers.services.errors import CoverageError
+from amers.services.geodesy import longitudes_near
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.rpc import RpcModel, cubic_terms
+from amers.services.types import Array
 
 RIDGES = (1e-5, 1e-3, 1e-1)
 """Dampings of the coefficients relative to a misfit of one normalised unit, without which the 39

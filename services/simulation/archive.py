@@ -9,12 +9,12 @@ from datetime import UTC, date, datetime, timedelta
 
 import numpy as np
 
-from services.geodesy import metres_per_degree
-from services.simulation.conditions import Conditions
-from services.simulation.render import Radiometry
-from services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
-from services.simulation.world import World
-from services.types import Array
+from amers.services.geodesy import metres_per_degree
+from amers.services.simulation.conditions import Conditions
+from amers.services.simulation.render import Radiometry
+from amers.services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
+from amers.services.simulation.world import World
+from amers.services.types import Array
 
 CENTRE_LON_LAT = (5.4, 43.6)
 PASS_SIGMA_M, IMAGE_SIGMA_M = 5.0, 1.0

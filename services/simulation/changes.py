@@ -6,9 +6,9 @@ from datetime import date, timedelta
 
 import numpy as np
 
-from services.simulation.land import NO_ROOF, WATER
-from services.simulation.world import World
-from services.types import Array, IntArray
+from amers.services.simulation.land import NO_ROOF, WATER
+from amers.services.simulation.world import World
+from amers.services.types import Array, IntArray
 
 _SIDE_M = (20.0, 140.0)
 """Shortest and longest side of a changed rectangle."""

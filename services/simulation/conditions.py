@@ -4,11 +4,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.errors import InputError
-from services.simulation.grid import bilinear_values
-from services.simulation.render import Radiometry
-from services.simulation.world import natural_noise
-from services.types import Array, FloatImage
+from amers.services.errors import InputError
+from amers.services.simulation.grid import bilinear_values
+from amers.services.simulation.render import Radiometry
+from amers.services.simulation.world import natural_noise
+from amers.services.types import Array, FloatImage
 
 HAZE_LIGHT = 0.35
 """Light of haze that hides all contrast, relative to white ground in the sun."""

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from services.errors import InputError
-from services.imagery.source import ImageSource, Window
-from services.simulation.render import BRIGHTEST
-from services.types import Array, FloatImage
+from amers.services.errors import InputError
+from amers.services.imagery.source import ImageSource, Window
+from amers.services.simulation.render import BRIGHTEST
+from amers.services.types import Array, FloatImage
 
 _SAMPLED_WINDOWS = 5
 _SAMPLED_PX = 64

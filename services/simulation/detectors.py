@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.simulation.render import NODE_SPACING
-from services.types import Array
+from amers.services.simulation.render import NODE_SPACING
+from amers.services.types import Array
 
 
 @dataclass(frozen=True)

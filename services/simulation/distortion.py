@@ -8,8 +8,8 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.polynomial.legendre import legval
 
-from services.imagery.source import ImageSource, Window, sample_image
-from services.types import Array, BoolArray, FloatImage, IntArray
+from amers.services.imagery.source import ImageSource, Window, sample_image
+from amers.services.types import Array, BoolArray, FloatImage, IntArray
 
 Turn = Literal["", "swapped", "mirrored", "upside down"]
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from services.types import Array, FloatImage
+from amers.services.types import Array, FloatImage
 
 
 @njit(cache=True)

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from services.simulation.grid import bilinear
-from services.types import Array, FloatImage
+from amers.services.simulation.grid import bilinear
+from amers.services.types import Array, FloatImage
 
 NO_ROOF = np.float32(-np.inf)
 """Roof height of open ground."""

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from services.imagery.source import BLUR_PER_RATIO
-from services.simulation.land import NO_ROOF, WATER
-from services.simulation.world import World, natural_noise
-from services.types import BoolArray, FloatImage
+from amers.services.imagery.source import BLUR_PER_RATIO
+from amers.services.simulation.land import NO_ROOF, WATER
+from amers.services.simulation.world import World, natural_noise
+from amers.services.types import BoolArray, FloatImage
 
 SKY_LIGHT = 0.30
 """Share of the light on level ground that comes from the whole sky, also into shadows."""

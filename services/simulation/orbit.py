@@ -6,19 +6,19 @@ from datetime import datetime
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from services.errors import InputError
-from services.geodesy import (
+from amers.services.errors import InputError
+from amers.services.geodesy import (
     WGS84_A,
     ecef_from_east_north_up,
     ecef_from_lon_lat_h,
     lon_lat_h_from_ecef,
 )
-from services.sensors.attitude import interpolated_attitude
-from services.sensors.light_path import EARTH_ROTATION_RAD_S
-from services.sensors.piecewise import lagrange, polynomial
-from services.sensors.pushbroom import PushbroomModel
-from services.sensors.rpc import VALIDITY
-from services.types import Array
+from amers.services.sensors.attitude import interpolated_attitude
+from amers.services.sensors.light_path import EARTH_ROTATION_RAD_S
+from amers.services.sensors.piecewise import lagrange, polynomial
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.sensors.rpc import VALIDITY
+from amers.services.types import Array
 
 EARTH_GM_M3_S2 = 3.986004418e14
 INCLINATION_DEG = 98.2

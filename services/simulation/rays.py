@@ -7,9 +7,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from services.simulation.grid import bilinear
-from services.simulation.land import NO_ROOF
-from services.types import Array, BoolArray, FloatImage
+from amers.services.simulation.grid import bilinear
+from amers.services.simulation.land import NO_ROOF
+from amers.services.types import Array, BoolArray, FloatImage
 
 GROUND, ROOF, WALL_EAST_WEST, WALL_NORTH_SOUTH = 0, 1, 2, 3
 """Kinds of surface; a wall has the name of the directions that it may face."""

@@ -7,18 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from services.errors import InputError
-from services.sensors.base import SensorModel
-from services.simulation.light import SKY_LIGHT, near_buildings
-from services.simulation.rays import (
+from amers.services.errors import InputError
+from amers.services.sensors.base import SensorModel
+from amers.services.simulation.light import SKY_LIGHT, near_buildings
+from amers.services.simulation.rays import (
     WALL_ALBEDO,
     LitSurface,
     RayNodes,
     intersect_surface,
     render_lines,
 )
-from services.simulation.world import World
-from services.types import Array, BoolArray, FloatImage
+from amers.services.simulation.world import World
+from amers.services.types import Array, BoolArray, FloatImage
 
 DARKEST, BRIGHTEST = 1, 4095
 """Range of the pixels: 12 bits, with zero reserved for nodata."""

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from services.imagery.source import Window
-from services.simulation.conditions import (
+from amers.services.imagery.source import Window
+from amers.services.simulation.conditions import (
     CLEAR,
     Clouds,
     Conditions,
@@ -18,21 +18,21 @@ from services.simulation.conditions import (
     seen_through,
     under_clouds,
 )
-from services.simulation.detectors import PERFECT, Detectors
-from services.simulation.distortion import Distortion
-from services.simulation.land import NO_ROOF
-from services.simulation.light import Day, averaged, day_of, radiance, smoothing_margin
-from services.simulation.rays import RayNodes, intersect_surface
-from services.simulation.render import (
+from amers.services.simulation.detectors import PERFECT, Detectors
+from amers.services.simulation.distortion import Distortion
+from amers.services.simulation.land import NO_ROOF
+from amers.services.simulation.light import Day, averaged, day_of, radiance, smoothing_margin
+from amers.services.simulation.rays import RayNodes, intersect_surface
+from amers.services.simulation.render import (
     NODE_SPACING,
     digitise,
     light_along_rays,
     ray_nodes,
     ray_setup,
 )
-from services.simulation.view import ViewGeometry
-from services.simulation.world import World
-from services.types import Array, FloatImage
+from amers.services.simulation.view import ViewGeometry
+from amers.services.simulation.world import World
+from amers.services.types import Array, FloatImage
 
 TILE_PX = NODE_SPACING
 _CELLS = 128

@@ -7,23 +7,23 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import numpy.typing as npt
 
-from services.errors import ComputationError
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.sensors.base import SensorModel
-from services.sensors.correction import (
+from amers.services.errors import ComputationError
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.correction import (
     CorrectedModel,
     ImageCorrection,
     no_correction,
 )
-from services.sensors.pushbroom import PushbroomModel
-from services.sensors.rpc import RpcModel
-from services.sensors.rpc_fit import fit_rpc
-from services.simulation.light import radiance_of_day, smooth_radiance
-from services.simulation.orbit import pushbroom_over, sun_direction
-from services.simulation.render import Radiometry, ray_setup, render, surface_seen
-from services.simulation.world import World
-from services.types import Acquisition, Array
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.sensors.rpc import RpcModel
+from amers.services.sensors.rpc_fit import fit_rpc
+from amers.services.simulation.light import radiance_of_day, smooth_radiance
+from amers.services.simulation.orbit import pushbroom_over, sun_direction
+from amers.services.simulation.render import Radiometry, ray_setup, render, surface_seen
+from amers.services.simulation.world import World
+from amers.services.types import Acquisition, Array
 
 PLAIN_RADIOMETRY = Radiometry()
 

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import fft
 
-from services.geodesy import metres_per_degree, wrapped_degrees
-from services.simulation.grid import bilinear_values
-from services.simulation.land import NO_ROOF, WATER, LandNoise, cover_land
-from services.types import Array, FloatImage
+from amers.services.geodesy import metres_per_degree, wrapped_degrees
+from amers.services.simulation.grid import bilinear_values
+from amers.services.simulation.land import NO_ROOF, WATER, LandNoise, cover_land
+from amers.services.types import Array, FloatImage
 
 Parcels = npt.NDArray[np.uint16]
 

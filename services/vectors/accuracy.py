@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from services.quality.correction_accuracy import CorrectionAccuracy
-from services.quality.normal_law import normal_ce90
-from services.sensors.base import SensorModel
-from services.terrain import Terrain
-from services.types import Array
+from amers.services.quality.correction_accuracy import CorrectionAccuracy
+from amers.services.quality.normal_law import normal_ce90
+from amers.services.sensors.base import SensorModel
+from amers.services.terrain import Terrain
+from amers.services.types import Array
 
 
 @dataclass(frozen=True)

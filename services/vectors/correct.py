@@ -6,14 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from pyproj import CRS
 
-from services.imagery.scene import Scene, scene_centre, scene_gsd_m
-from services.lines_of_sight import ground_in_sight, intersect_terrain
-from services.map_grid import MapGrid, xy_of_lon_lat
-from services.terrain import Terrain
-from services.types import Array, BoolArray
-from services.vectors.accuracy import ErrorSources, VertexAccuracy, predict_vertices
-from services.vectors.curves import Transformation, curved
-from services.vectors.shapes import Shapes, place_of
+from amers.services.imagery.scene import Scene, scene_centre, scene_gsd_m
+from amers.services.lines_of_sight import ground_in_sight, intersect_terrain
+from amers.services.map_grid import MapGrid, xy_of_lon_lat
+from amers.services.terrain import Terrain
+from amers.services.types import Array, BoolArray
+from amers.services.vectors.accuracy import ErrorSources, VertexAccuracy, predict_vertices
+from amers.services.vectors.curves import Transformation, curved
+from amers.services.vectors.shapes import Shapes, place_of
 
 FINEST_PIECE_PX = 0.5
 """Edges are not cut into shorter pieces, however fine the terrain is."""

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
-from services.types import Array, BoolArray, IntArray
-from services.vectors.shapes import Shapes
+from amers.services.types import Array, BoolArray, IntArray
+from amers.services.vectors.shapes import Shapes
 
 _BATCH = 2_000_000
 """Places that are transformed at once."""

@@ -5,16 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from services.errors import InputError
-from services.geodesy import continuous
-from services.imagery.scene import Scene, scene_centre, scene_footprint, scene_gsd_m
-from services.lines_of_sight import intersect_terrain
-from services.map_grid import lon_lat_of_xy, xy_of_lon_lat
-from services.terrain import Terrain
-from services.types import Array, BoolArray
-from services.vectors.correct import FINEST_PIECE_PX, has_heights, units_per_metre
-from services.vectors.curves import Transformation, curved
-from services.vectors.shapes import Geometries, Shapes
+from amers.services.errors import InputError
+from amers.services.geodesy import continuous
+from amers.services.imagery.scene import Scene, scene_centre, scene_footprint, scene_gsd_m
+from amers.services.lines_of_sight import intersect_terrain
+from amers.services.map_grid import lon_lat_of_xy, xy_of_lon_lat
+from amers.services.terrain import Terrain
+from amers.services.types import Array, BoolArray
+from amers.services.vectors.correct import FINEST_PIECE_PX, has_heights, units_per_metre
+from amers.services.vectors.curves import Transformation, curved
+from amers.services.vectors.shapes import Geometries, Shapes
 
 HIDDEN_M = 0.1
 """A vertex is hidden where the line of sight first meets ground that is higher by more than this."""

@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from services.errors import InputError
-from services.types import Array, BoolArray, IntArray
+from amers.services.errors import InputError
+from amers.services.types import Array, BoolArray, IntArray
 
 Geometries = npt.NDArray[np.object_]
 """Geometries (n,) of shapely; None where a feature has none."""

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import rasterio
 
-from services.formats.sensor_models.rpc_text import parse_rpc_text
+from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
 from tests.app.flat_world import FlatWorld
 from tests.app.hostile_installation import LIMIT_BYTES
 

@@ -13,13 +13,13 @@ from fastapi.testclient import TestClient
 from psycopg import sql
 from pydantic import SecretStr
 
-from app.config import Settings
-from app.db import engine, revisions
-from app.db.cluster.embedded import ROLE, SUPERUSER, Cluster
-from app.db.engine import Connection, Database
-from app.main import create_app
-from app.storage import MARKER, Storage
-from app.usecases.tokens import create_token, list_tokens
+from amers.app.config import Settings
+from amers.app.db import engine, revisions
+from amers.app.db.cluster.embedded import ROLE, SUPERUSER, Cluster
+from amers.app.db.engine import Connection, Database
+from amers.app.main import create_app
+from amers.app.storage import MARKER, Storage
+from amers.app.usecases.tokens import create_token, list_tokens
 
 if TYPE_CHECKING:
     from tests.app import full_storage

@@ -14,16 +14,16 @@ from typing import Any
 
 from sqlalchemy import select
 
-from app.db.features import cql2_process
-from app.db.features.collection import Collection
-from app.db.features.cql2 import translate
-from app.db.features.cql2_bounds import parse_json, parse_text
-from app.db.features.cql2_tokens import TOKEN
-from app.db.features.crs import CRS84
-from app.db.history import HISTORY
-from app.db.points import POINTS
-from app.db.statements import hot
-from app.errors import InvalidParameter
+from amers.app.db.features import cql2_process
+from amers.app.db.features.collection import Collection
+from amers.app.db.features.cql2 import translate
+from amers.app.db.features.cql2_bounds import parse_json, parse_text
+from amers.app.db.features.cql2_tokens import TOKEN
+from amers.app.db.features.crs import CRS84
+from amers.app.db.history import HISTORY
+from amers.app.db.points import POINTS
+from amers.app.db.statements import hot
+from amers.app.errors import InvalidParameter
 from tests.app.filter_grammar import Grammar
 
 JSON_SHARE = 0.2

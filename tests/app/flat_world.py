@@ -7,15 +7,15 @@ import cv2
 import numpy as np
 import rasterio
 
-from app.db import engine
-from app.storage import Storage
-from app.usecases.blocks.lifecycle import ingest_block, publish_block
-from services.formats.block.writer import write_block
-from services.formats.images.raster import gdal_rpc
-from services.formats.sensor_models.rpc_text import format_rpc_text
-from services.imagery.source import ArrayImage, render_chip
-from services.sensors.rpc import RpcModel
-from services.types import UNKNOWN_FRAME, Array, ChipArray, ControlPoints, FloatImage, Frame, Views
+from amers.app.db import engine
+from amers.app.storage import Storage
+from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
+from amers.services.formats.block.writer import write_block
+from amers.services.formats.images.raster import gdal_rpc
+from amers.services.formats.sensor_models.rpc_text import format_rpc_text
+from amers.services.imagery.source import ArrayImage, render_chip
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import UNKNOWN_FRAME, Array, ChipArray, ControlPoints, FloatImage, Frame, Views
 from tests.factories import images, metadata
 
 CENTRE = np.array([5.25, 43.25])

@@ -9,14 +9,14 @@ from uuid import uuid4
 import pytest
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import engine, stored_files
-from app.db.cluster.embedded import Cluster
-from app.db.engine import Connection
-from app.main import create_app
-from app.storage import Storage
-from app.usecases.blocks.lifecycle import ingest_block
-from app.usecases.tokens import create_token
+from amers.app.config import Settings
+from amers.app.db import engine, stored_files
+from amers.app.db.cluster.embedded import Cluster
+from amers.app.db.engine import Connection
+from amers.app.main import create_app
+from amers.app.storage import Storage
+from amers.app.usecases.blocks.lifecycle import ingest_block
+from amers.app.usecases.tokens import create_token
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.s3_server import running_bucket
 from tests.factories import make_block

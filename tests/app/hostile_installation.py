@@ -12,14 +12,14 @@ from uuid import UUID
 import httpx
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import engine
-from app.db.engine import Database
-from app.main import create_app
-from app.storage import Storage
-from app.usecases.blocks.lifecycle import ingest_block, publish_block
-from app.usecases.jobs import do_attempt
-from app.usecases.tokens import create_token
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.engine import Database
+from amers.app.main import create_app
+from amers.app.storage import Storage
+from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
+from amers.app.usecases.jobs import do_attempt
+from amers.app.usecases.tokens import create_token
 from tests.app.flat_world import SIGMA_M, FlatWorld
 from tests.app.job_queue import claim
 from tests.factories import make_block

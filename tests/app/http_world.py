@@ -12,13 +12,13 @@ from fastapi import FastAPI
 from fastapi.routing import iter_route_contexts
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import engine
-from app.main import create_app
-from app.storage import Storage
-from app.usecases.blocks import lifecycle
-from app.usecases.jobs import do_attempt
-from app.usecases.tokens import create_token
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.main import create_app
+from amers.app.storage import Storage
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.jobs import do_attempt
+from amers.app.usecases.tokens import create_token
 from tests.app.job_queue import claim
 from tests.factories import BOX, make_block
 

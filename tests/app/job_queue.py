@@ -2,9 +2,9 @@
 
 from uuid import UUID, uuid4
 
-from app.db.engine import Connection, Database
-from app.db.jobs import attempts, jobs
-from app.db.jobs.jobs import Job
+from amers.app.db.engine import Connection, Database
+from amers.app.db.jobs import attempts, jobs
+from amers.app.db.jobs.jobs import Job
 from tests.statements import run_sql
 
 LEASE_S = 30.0

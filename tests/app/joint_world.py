@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import rasterio
 
-from services.formats.images.raster import gdal_rpc
-from services.sensors.rpc import RpcModel
-from services.types import FloatImage
+from amers.services.formats.images.raster import gdal_rpc
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import FloatImage
 from tests.app.flat_world import FlatWorld, flat_texture
 
 A_FIFTH_OF_A_PIXEL = 0.2

@@ -5,11 +5,11 @@ from uuid import UUID, uuid4
 
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import usage
-from app.db.engine import Connection, Database
-from app.storage import Storage
-from app.usecases.jobs import do_attempt
+from amers.app.config import Settings
+from amers.app.db import usage
+from amers.app.db.engine import Connection, Database
+from amers.app.storage import Storage
+from amers.app.usecases.jobs import do_attempt
 from tests.app.job_queue import claim
 
 LEDGER_PREFIXES = ("scenes", "results", "uploads")

@@ -13,7 +13,7 @@ import psycopg
 from psycopg import sql
 from psycopg.conninfo import make_conninfo
 
-from app.db.cluster.binaries import ServerUser, find_binaries, run_as, server_user
+from amers.app.db.cluster.binaries import ServerUser, find_binaries, run_as, server_user
 from tests.service_process import free_port
 
 SUPERUSER = "postgres"

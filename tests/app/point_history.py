@@ -1,6 +1,6 @@
 """Simulated time for a store: recorded times are moved into the past."""
 
-from app.db.engine import Connection
+from amers.app.db.engine import Connection
 from tests.statements import run_sql
 
 MOVED = (

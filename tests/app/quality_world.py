@@ -7,9 +7,9 @@ import numpy as np
 import rasterio
 from rasterio.transform import from_origin
 
-from app.usecases.production import BlockIdentity, OrthoFiles, run_ortho_production
-from services.production.from_ortho import OrthoPointOptions
-from services.types import Array
+from amers.app.usecases.production import BlockIdentity, OrthoFiles, run_ortho_production
+from amers.services.production.from_ortho import OrthoPointOptions
+from amers.services.types import Array
 from tests.services.textures import moved, texture
 
 GSD_M = 2.0

@@ -7,12 +7,12 @@ import numpy as np
 import rasterio
 from jsonschema import validate
 
-from app.usecases.registration.deliverables import OUTPUTS
-from services.formats.gcp.reader import read_control_points
-from services.formats.sensor_models.rpc_files import read_rpc
-from services.reports.document import report_schema
-from services.sensors.base import SensorModel
-from services.sensors.rpc import RpcModel
+from amers.app.usecases.registration.deliverables import OUTPUTS
+from amers.services.formats.gcp.reader import read_control_points
+from amers.services.formats.sensor_models.rpc_files import read_rpc
+from amers.services.reports.document import report_schema
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.rpc import RpcModel
 from tests.app.flat_world import CENTRE, GROUND_H, FlatWorld
 
 A_TENTH_OF_A_PIXEL = 0.1

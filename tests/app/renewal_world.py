@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import rasterio
 
-from services.formats.block.check import check_block
-from services.formats.images.raster import gdal_rpc
-from services.types import Array, FloatImage, IntArray
+from amers.services.formats.block.check import check_block
+from amers.services.formats.images.raster import gdal_rpc
+from amers.services.types import Array, FloatImage, IntArray
 from tests.app.flat_world import FlatWorld, flat_texture, make_flat_world
 
 POINTS = 100

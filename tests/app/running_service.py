@@ -10,13 +10,13 @@ from pathlib import Path
 
 import httpx
 
-from app.config import Settings
-from app.db import engine
-from app.db.cluster.embedded import Cluster
-from app.storage import Storage
-from app.usecases.blocks import lifecycle
-from app.usecases.tokens import create_token
-from services.types import ControlPoints
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.cluster.embedded import Cluster
+from amers.app.storage import Storage
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.tokens import create_token
+from amers.services.types import ControlPoints
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.worker_processes import children, wait_until
 from tests.factories import MadeBlock, make_block
@@ -70,7 +70,7 @@ def service_with_a_block(
         log = folder / "log"
         with log.open("wb") as output:
             process = subprocess.Popen(
-                [sys.executable, "-m", "app.cli.main", "serve", "--no-worker", "--port", str(port)],
+                [sys.executable, "-m", "amers", "serve", "--no-worker", "--port", str(port)],
                 env=environment,
                 stdout=output,
                 stderr=output,
@@ -102,7 +102,7 @@ def running_service(settings: Settings, log: Path, *options: str) -> Iterator[st
         "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
         "AMERS_DATA_FOLDER": str(settings.data_folder),
     }
-    command = [sys.executable, "-m", "app.cli.main", "serve", "--port", str(port), *options]
+    command = [sys.executable, "-m", "amers", "serve", "--port", str(port), *options]
     with log.open("wb") as output:
         service = subprocess.Popen(command, env=environment, stdout=output, stderr=output)
     try:

@@ -11,7 +11,7 @@ import httpx
 from fastapi.testclient import TestClient
 from pydantic import SecretStr
 
-from app.main import create_app
+from amers.app.main import create_app
 from tests.app.flat_world import SIGMA_M, make_flat_world
 from tests.app.hostile_installation import Installation, hostile_installation
 

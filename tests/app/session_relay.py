@@ -15,7 +15,7 @@ from pathlib import Path
 import psycopg
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 
-from app.db.cluster.embedded import SUPERUSER
+from amers.app.db.cluster.embedded import SUPERUSER
 
 STATEMENTS = (b"Q", b"E", b"c")
 """Messages of a client that let the server do something: a query, a prepared one, the end of a COPY."""

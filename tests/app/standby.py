@@ -9,8 +9,8 @@ from pathlib import Path
 import psycopg
 from psycopg.conninfo import make_conninfo
 
-from app.db.cluster.binaries import find_binaries, run_as, server_user
-from app.db.cluster.embedded import ROLE, SUPERUSER
+from amers.app.db.cluster.binaries import find_binaries, run_as, server_user
+from amers.app.db.cluster.embedded import ROLE, SUPERUSER
 from tests.service_process import until
 
 PORT = 5432

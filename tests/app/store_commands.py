@@ -13,28 +13,28 @@ from uuid import uuid4
 import numpy as np
 from pydantic import SecretStr
 
-from app.cli.commands import COMMANDS
-from app.cli.on_demand import Group, Tree
-from app.config import Settings
-from app.db import engine
-from app.db.cluster.embedded import Cluster
-from app.storage import Storage
-from app.usecases import storage_identity
-from app.usecases.backups.make import make_backup
-from app.usecases.blocks import lifecycle
-from app.usecases.history import suspend_point
-from app.usecases.installation import Installation
-from app.usecases.references import NewReference, add_reference
-from app.usecases.registration.control_sources import points_of_store
-from app.usecases.registration.register import (
+from amers.app.cli.commands import COMMANDS
+from amers.app.cli.on_demand import Group, Tree
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.cluster.embedded import Cluster
+from amers.app.storage import Storage
+from amers.app.usecases import storage_identity
+from amers.app.usecases.backups.make import make_backup
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.history import suspend_point
+from amers.app.usecases.installation import Installation
+from amers.app.usecases.references import NewReference, add_reference
+from amers.app.usecases.registration.control_sources import points_of_store
+from amers.app.usecases.registration.register import (
     ControlSources,
     SceneFiles,
     image_key,
     record_registration,
     run_registration,
 )
-from app.usecases.tokens import create_token
-from services.registration.options import RegistrationOptions
+from amers.app.usecases.tokens import create_token
+from amers.services.registration.options import RegistrationOptions
 from tests.app.conftest import fresh_database
 from tests.app.flat_world import CENTRE, SIGMA_M, make_flat_world
 from tests.app.joint_world import write_scenes

@@ -16,12 +16,12 @@ import pytest
 from fastapi import APIRouter, FastAPI
 from fastapi.routing import APIRoute
 
-from app.api import openapi
-from app.api.access import FURTHER_SCOPES
-from app.api.credentials import BEARER
-from app.auth import INCLUDED, Scope
-from app.config import Settings
-from app.main import ROUTERS, create_app
+from amers.app.api import openapi
+from amers.app.api.access import FURTHER_SCOPES
+from amers.app.api.credentials import BEARER
+from amers.app.auth import INCLUDED, Scope
+from amers.app.config import Settings
+from amers.app.main import ROUTERS, create_app
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.flat_world import SIGMA_M, make_flat_world
 from tests.app.hostile_installation import Installation, hostile_installation, told

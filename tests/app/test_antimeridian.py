@@ -12,24 +12,24 @@ import pytest
 import shapely
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import engine
-from app.db.features.antimeridian import on_the_map
-from app.db.features.crs import EPSG_3857
-from app.db.points import control_points
-from app.db.scenes import set_footprint
-from app.storage import Storage
-from app.usecases.blocks.lifecycle import ingest_block, publish_block
-from app.usecases.image_production import ProductionImages, run_production
-from app.usecases.production import BlockIdentity
-from app.usecases.registration.control_sources import points_of_store
-from app.usecases.registration.register import ControlSources, SceneFiles, run_registration
-from services.formats.block.check import check_block
-from services.formats.images.raster import write_raster
-from services.imagery.scene import scene_footprint
-from services.production.from_images import ProductionOptions
-from services.simulation.view import SimulatedView, ViewPlan, simulate_block, simulate_view
-from services.simulation.world import World, make_world
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.features.antimeridian import on_the_map
+from amers.app.db.features.crs import EPSG_3857
+from amers.app.db.points import control_points
+from amers.app.db.scenes import set_footprint
+from amers.app.storage import Storage
+from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
+from amers.app.usecases.image_production import ProductionImages, run_production
+from amers.app.usecases.production import BlockIdentity
+from amers.app.usecases.registration.control_sources import points_of_store
+from amers.app.usecases.registration.register import ControlSources, SceneFiles, run_registration
+from amers.services.formats.block.check import check_block
+from amers.services.formats.images.raster import write_raster
+from amers.services.imagery.scene import scene_footprint
+from amers.services.production.from_images import ProductionOptions
+from amers.services.simulation.view import SimulatedView, ViewPlan, simulate_block, simulate_view
+from amers.services.simulation.world import World, make_world
 
 pytestmark = pytest.mark.long
 

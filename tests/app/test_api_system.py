@@ -4,13 +4,21 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from app.api import error_responses
-from app.api.deps import Admin, DatabaseDep, PointsReader, Reader, Registrar
-from app.db import engine
-from app.errors import AmersError, ComputationError, Conflict, InputError, NotAllowed, NotFound, TooLarge
-from app.main import create_app
-from app.usecases.tokens import create_token, list_tokens
-from services.errors import NotEnoughPoints
+from amers.app.api import error_responses
+from amers.app.api.deps import Admin, DatabaseDep, PointsReader, Reader, Registrar
+from amers.app.db import engine
+from amers.app.errors import (
+    AmersError,
+    ComputationError,
+    Conflict,
+    InputError,
+    NotAllowed,
+    NotFound,
+    TooLarge,
+)
+from amers.app.main import create_app
+from amers.app.usecases.tokens import create_token, list_tokens
+from amers.services.errors import NotEnoughPoints
 from tests.statements import run_sql
 
 SCOPES = {"read": Reader, "register": Registrar, "admin": Admin}

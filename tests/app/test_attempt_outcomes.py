@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import pytest
 
-from app.config import Settings
-from app.db.engine import Database
-from app.db.jobs import jobs
-from app.db.jobs.jobs import Job
-from app.errors import InputError
-from app.storage import Storage
-from app.worker import attempt
-from app.worker.attempt import ATTEMPTS_ALLOWED, NO_ROOM, OUT_OF_MEMORY, Attempts
+from amers.app.config import Settings
+from amers.app.db.engine import Database
+from amers.app.db.jobs import jobs
+from amers.app.db.jobs.jobs import Job
+from amers.app.errors import InputError
+from amers.app.storage import Storage
+from amers.app.worker import attempt
+from amers.app.worker.attempt import ATTEMPTS_ALLOWED, NO_ROOM, OUT_OF_MEMORY, Attempts
 from tests.app.job_queue import new_job, state_of
 from tests.statements import run_sql
 

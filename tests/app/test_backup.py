@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from pyogrio.raw import read
 
-from app.db import engine
-from app.storage import Storage
-from app.usecases.blocks.lifecycle import ingest_block, publish_block
-from app.usecases.tokens import create_token
+from amers.app.db import engine
+from amers.app.storage import Storage
+from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
+from amers.app.usecases.tokens import create_token
 from tests.app.flat_world import SIGMA_M, make_flat_world
 from tests.app.worker_processes import wait_until
 from tests.factories import make_block
@@ -70,7 +70,7 @@ def features(tile: bytes, folder: Path) -> list[tuple[object, ...]]:
 
 def amers(service: Service, *words: str | Path) -> dict[str, object]:
     result = subprocess.run(
-        [sys.executable, "-m", "app.cli.main", *map(str, words), "--json"],
+        [sys.executable, "-m", "amers", *map(str, words), "--json"],
         env=service.environment,
         capture_output=True,
         text=True,

@@ -10,16 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from app.config import Settings
-from app.db import engine, installation, stored_files
-from app.db.cluster import backup as archive
-from app.db.cluster.embedded import Cluster
-from app.errors import Conflict, InputError
-from app.storage import MARKER, Marker, Storage, open_storage, read_marker, trash
-from app.usecases import storage_identity
-from app.usecases.backups import make
-from app.usecases.backups.make import make_backup
-from app.usecases.backups.manifest import (
+from amers.app.config import Settings
+from amers.app.db import engine, installation, stored_files
+from amers.app.db.cluster import backup as archive
+from amers.app.db.cluster.embedded import Cluster
+from amers.app.errors import Conflict, InputError
+from amers.app.storage import MARKER, Marker, Storage, open_storage, read_marker, trash
+from amers.app.usecases import storage_identity
+from amers.app.usecases.backups import make
+from amers.app.usecases.backups.make import make_backup
+from amers.app.usecases.backups.manifest import (
     ARCHIVE,
     MANIFEST,
     STORAGE,
@@ -27,9 +27,9 @@ from app.usecases.backups.manifest import (
     find_problems,
     read_manifest,
 )
-from app.usecases.backups.restore import RESTORING, restore_backup
-from app.usecases.installation import Installation
-from app.worker.sweep import sweep_files
+from amers.app.usecases.backups.restore import RESTORING, restore_backup
+from amers.app.usecases.installation import Installation
+from amers.app.worker.sweep import sweep_files
 from tests.app.conftest import EMPTY_TEMPLATE, fresh_database
 from tests.app.full_storage import Full, another, contents
 from tests.statements import run_sql
@@ -40,7 +40,7 @@ pytestmark = pytest.mark.thorough
 KILLED_AT = """
 import os, sys
 from importlib import import_module
-from app.cli.main import main
+from amers.app.cli.main import main
 module, name, calls = sys.argv.pop(1).split(":")
 module = import_module(module)
 original, left = getattr(module, name), [int(calls)]
@@ -60,7 +60,7 @@ def amers(
 ) -> "subprocess.CompletedProcess[str]":
     """Run a command on an installation; with `killed_at` it kills itself at a call of a function."""
     assert settings.database_url is not None
-    program = ["-c", KILLED_AT, killed_at] if killed_at else ["-m", "app.cli.main"]
+    program = ["-c", KILLED_AT, killed_at] if killed_at else ["-m", "amers"]
     environment = os.environ | {
         "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
         "AMERS_DATA_FOLDER": str(settings.data_folder),
@@ -242,9 +242,9 @@ def test_a_backup_that_is_not_as_it_was_written_is_refused_and_restores_nothing(
 
 BACKUP_STAGES = ("_copy:0", "_copy:3", "write_manifest:0", "_sync_folders:0")
 RESTORE_STAGES = (
-    "app.usecases.backups.restore:_restore_file:3",
-    "app.db.cluster.backup:restore:0",
-    "app.db.revisions:upgrade:0",
+    "amers.app.usecases.backups.restore:_restore_file:3",
+    "amers.app.db.cluster.backup:restore:0",
+    "amers.app.db.revisions:upgrade:0",
 )
 
 
@@ -252,7 +252,7 @@ RESTORE_STAGES = (
 def test_a_kill_during_a_backup_leaves_nothing_that_looks_like_one(full: Full, tmp_path: Path):
     folder = tmp_path / "backups" / "monday"
     for stage in BACKUP_STAGES:
-        place = f"app.usecases.backups.make:{stage}"
+        place = f"amers.app.usecases.backups.make:{stage}"
         assert amers(full.settings, "db", "backup", folder, killed_at=place).returncode == KILLED
         assert not folder.exists()
         assert [path.name for path in folder.parent.iterdir()] == [".monday.unfinished"]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from app.usecases.backups.manifest import find_problems, read_manifest
+from amers.app.usecases.backups.manifest import find_problems, read_manifest
 from tests.app.full_storage import Full, contents
 from tests.app.small_disk import Disk
 from tests.app.test_backup_sets import KILLED_AT, amers, backed_up
@@ -75,7 +75,11 @@ def test_an_interrupted_backup_says_so_and_leaves_nothing(
     stage: str, full: Full, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     module, _, name = stage.rpartition(".")
-    place = f"app.usecases.backups.make:{stage}" if not module else f"app.db.cluster.backup:{name}"
+    place = (
+        f"amers.app.usecases.backups.make:{stage}"
+        if not module
+        else f"amers.app.db.cluster.backup:{name}"
+    )
     # Processes in the background of a shell start with interrupts ignored.
     heeding = "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)"
     interrupted = heeding + KILLED_AT.replace("os.getpid(), 9", f"os.getpid(), {int(signal.SIGINT)}")

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from app.usecases.registration.failure import FAILURE_OUTPUTS
+from amers.app.usecases.registration.failure import FAILURE_OUTPUTS
 from tests.app.bad_images import ARCHIVES, IMAGES, MODELS, BadScene, folder_archive
 from tests.app.bad_requests import BAD_REQUESTS
 from tests.app.conftest import TEMPLATE, fresh_database

@@ -9,10 +9,10 @@ from uuid import uuid4
 import pytest
 from fastapi.testclient import TestClient
 
-from app.api.routes import _key
-from app.config import Settings
-from app.db.cluster.embedded import Cluster
-from app.main import create_app
+from amers.app.api.routes import _key
+from amers.app.config import Settings
+from amers.app.db.cluster.embedded import Cluster
+from amers.app.main import create_app
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.statements import run_sql
 
@@ -310,7 +310,7 @@ def app_keys(monkeypatch: pytest.MonkeyPatch) -> list[object]:
         keys.append(_key(*arguments))
         return keys[-1]
 
-    monkeypatch.setattr("app.api.routes._key", noted)
+    monkeypatch.setattr("amers.app.api.routes._key", noted)
     return keys
 
 

@@ -11,12 +11,12 @@ from fastapi.testclient import TestClient
 from numpy.testing import assert_allclose
 from typer.testing import CliRunner
 
-from app.cli.main import app as commands
-from app.db import engine
-from app.errors import InputError
-from app.main import create_app
-from app.usecases.blocks import lifecycle
-from app.usecases.jobs import do_attempt
+from amers.app.cli.main import app as commands
+from amers.app.db import engine
+from amers.app.errors import InputError
+from amers.app.main import create_app
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.jobs import do_attempt
 from tests.app.job_queue import claim
 from tests.factories import BOX, make_block
 

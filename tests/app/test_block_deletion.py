@@ -11,17 +11,17 @@ from uuid import UUID, uuid4
 import pytest
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import engine, history
-from app.db.engine import Connection, Database
-from app.errors import Conflict, NotFound
-from app.storage import Marker, Storage, trash, write_marker
-from app.usecases import storage_identity
-from app.usecases.blocks import lifecycle
-from app.usecases.blocks.deletion import delete_block
-from app.usecases.history import list_histories, suspend_point
-from app.usecases.installation import Installation
-from app.worker.sweep import sweep_files
+from amers.app.config import Settings
+from amers.app.db import engine, history
+from amers.app.db.engine import Connection, Database
+from amers.app.errors import Conflict, NotFound
+from amers.app.storage import Marker, Storage, trash, write_marker
+from amers.app.usecases import storage_identity
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.blocks.deletion import delete_block
+from amers.app.usecases.history import list_histories, suspend_point
+from amers.app.usecases.installation import Installation
+from amers.app.worker.sweep import sweep_files
 from tests.factories import MadeBlock, make_block
 from tests.statements import run_sql
 

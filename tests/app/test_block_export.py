@@ -10,19 +10,19 @@ import psycopg
 import pytest
 from numpy.testing import assert_allclose
 
-from app.db import engine
-from app.db import points as point_store
-from app.db.stored_files import find_chip_checksums
-from app.errors import InputError, NotFound
-from app.storage import StoredChips
-from app.usecases.blocks import lifecycle
-from app.usecases.blocks.export import EXPORT_BLOCK, ExportBlock, select_points, write_selected
-from app.usecases.jobs import do_attempt
-from app.usecases.processes import Work
-from services.formats.block.check import check_block
-from services.formats.block.document import rectangle
-from services.formats.block.writer import write_block
-from services.types import Frame, point_chips
+from amers.app.db import engine
+from amers.app.db import points as point_store
+from amers.app.db.stored_files import find_chip_checksums
+from amers.app.errors import InputError, NotFound
+from amers.app.storage import StoredChips
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.blocks.export import EXPORT_BLOCK, ExportBlock, select_points, write_selected
+from amers.app.usecases.jobs import do_attempt
+from amers.app.usecases.processes import Work
+from amers.services.formats.block.check import check_block
+from amers.services.formats.block.document import rectangle
+from amers.services.formats.block.writer import write_block
+from amers.services.types import Frame, point_chips
 from tests.app.job_queue import claim, claimed, new_job
 from tests.factories import BOX, control_points, make_block, metadata, noise_chips
 from tests.statements import run_sql

@@ -11,17 +11,17 @@ import pytest
 import shapely
 from sqlalchemy import text
 
-from app.db.blocks import ID_BITS, Block
-from app.db.engine import Connection
-from app.storage import Storage
-from app.usecases.blocks import lifecycle
-from app.usecases.blocks.lookup import block_extent
-from services.formats.block.writer import write_block
-from services.types import Array
+from amers.app.db.blocks import ID_BITS, Block
+from amers.app.db.engine import Connection
+from amers.app.storage import Storage
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.blocks.lookup import block_extent
+from amers.services.formats.block.writer import write_block
+from amers.services.types import Array
 from tests.factories import affine_model, control_points, metadata, noise_chips
 from tests.statements import run_sql
 
-FILL = import_module("migrations.versions.0014_outlines_of_blocks").FILL
+FILL = import_module("amers.migrations.versions.0014_outlines_of_blocks").FILL
 GSDS_M = (0.5,)
 SIDE_DEG = 0.1
 """Of the box that a block declares, in latitude."""

@@ -13,13 +13,13 @@ from jsonschema import Draft202012Validator
 from numpy.testing import assert_allclose
 from typer.testing import CliRunner
 
-from app.cli.main import app as commands
-from app.config import Settings
-from app.db.engine import Database
-from app.errors import InputError
-from app.storage import Storage
-from app.usecases.blocks.lifecycle import ingest_block
-from app.usecases.blocks.quality import (
+from amers.app.cli.main import app as commands
+from amers.app.config import Settings
+from amers.app.db.engine import Database
+from amers.app.errors import InputError
+from amers.app.storage import Storage
+from amers.app.usecases.blocks.lifecycle import ingest_block
+from amers.app.usecases.blocks.quality import (
     HeightFiles,
     QualityReferences,
     RequiredQuality,
@@ -27,9 +27,9 @@ from app.usecases.blocks.quality import (
     assess_folder,
     write_quality,
 )
-from app.usecases.terrain_file import TerrainFile
-from services.reports.block_quality import BlockQualityReport
-from services.reports.document import block_quality_schema, report_document
+from amers.app.usecases.terrain_file import TerrainFile
+from amers.services.reports.block_quality import BlockQualityReport
+from amers.services.reports.document import block_quality_schema, report_document
 from tests.app.ledger import job_runner
 from tests.app.quality_world import (
     HEIGHT_BIAS_M,

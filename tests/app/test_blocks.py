@@ -8,16 +8,16 @@ from numpy.testing import assert_allclose
 from pyproj import Geod
 from shapely import Polygon
 
-from app.db import points as point_store
-from app.db.engine import driver
-from app.db.stored_files import find_chip_checksums
-from app.errors import Conflict, NotFound
-from app.storage import StoredChips
-from app.usecases.blocks import lifecycle
-from app.usecases.blocks.listing import list_blocks
-from app.usecases.garbage_collection import Bin, remove_unnamed_chips
-from services.formats.block.document import rectangle
-from services.types import point_chips
+from amers.app.db import points as point_store
+from amers.app.db.engine import driver
+from amers.app.db.stored_files import find_chip_checksums
+from amers.app.errors import Conflict, NotFound
+from amers.app.storage import StoredChips
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.blocks.listing import list_blocks
+from amers.app.usecases.garbage_collection import Bin, remove_unnamed_chips
+from amers.services.formats.block.document import rectangle
+from amers.services.types import point_chips
 from tests.factories import BOX, make_block
 
 float32_rounding = 1e-6

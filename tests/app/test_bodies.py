@@ -12,11 +12,11 @@ from fastapi import FastAPI
 from fastapi.routing import APIRoute, iter_route_contexts
 from fastapi.testclient import TestClient
 
-from app.api import deps
-from app.api.body import ANONYMOUS_BODY_BYTES
-from app.api.routes import CallerRoute
-from app.config import Settings
-from app.main import create_app
+from amers.app.api import deps
+from amers.app.api.body import ANONYMOUS_BODY_BYTES
+from amers.app.api.routes import CallerRoute
+from amers.app.config import Settings
+from amers.app.main import create_app
 
 pytestmark = pytest.mark.security
 

@@ -12,10 +12,10 @@ import numpy as np
 import obstore
 import pytest
 
-from app.config import Settings
-from app.errors import DamagedFile, InputError, NotFound, StorageOutage, TooLarge
-from app.storage import Storage, StoredChips, bucket, chips_key
-from services.conventions import CHIP_SIZE
+from amers.app.config import Settings
+from amers.app.errors import DamagedFile, InputError, NotFound, StorageOutage, TooLarge
+from amers.app.storage import Storage, StoredChips, bucket, chips_key
+from amers.services.conventions import CHIP_SIZE
 from tests.app.s3_server import KEYS, running_bucket
 from tests.unproven import unproven_storage
 
@@ -204,7 +204,7 @@ def test_chips_are_read_from_a_bucket_by_ranges(storage: Storage, tmp_path: Path
 
 def test_an_address_that_is_none_is_refused_by_name(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("AMERS_STORAGE_URL", "http://elsewhere/bucket")
-    from app.config import read_settings
+    from amers.app.config import read_settings
 
     with pytest.raises(InputError, match="AMERS_STORAGE_URL"):
         read_settings()

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import engine
-from app.main import create_app
-from app.usecases.blocks.lifecycle import ingest_block, publish_block
-from services.formats.sensor_models.rpc_files import read_rpc
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.main import create_app
+from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
+from amers.services.formats.sensor_models.rpc_files import read_rpc
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
 from tests.app.registration_outputs import A_TENTH_OF_A_PIXEL, largest_error_px
 from tests.app.s3_server import running_bucket

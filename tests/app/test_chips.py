@@ -7,10 +7,10 @@ import pytest
 import rasterio
 from numpy.testing import assert_allclose, assert_array_equal
 
-from app.db import points as point_store
-from app.usecases.blocks import lifecycle
-from app.usecases.features import points
-from services.formats.chips import stacks
+from amers.app.db import points as point_store
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.features import points
+from amers.services.formats.chips import stacks
 from tests.factories import make_block
 
 CHIPS = "/collections/points/chips"

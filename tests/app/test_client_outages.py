@@ -9,8 +9,8 @@ from threading import Thread
 
 import pytest
 
-from app.client import Client, Job, RequestRefused, ServiceFailure
-from app.client import client as client_module
+from amers.app.client import Client, Job, RequestRefused, ServiceFailure
+from amers.app.client import client as client_module
 
 JOB = {"jobID": "7", "processID": "register-scene", "status": "running", "progress": 50, "message": ""}
 RUNNING = Job.of(JOB)

@@ -20,7 +20,7 @@ from numpy.testing import assert_allclose
 from owslib.ogcapi.features import Features
 from pyproj import CRS
 
-from app.api.connect import EXAMPLE, RECIPES, Recipe, as_markdown
+from amers.app.api.connect import EXAMPLE, RECIPES, Recipe, as_markdown
 from tests.app.running_service import Served, service_with_a_block
 
 BOX = (5.22, 43.21, 5.27, 43.26)

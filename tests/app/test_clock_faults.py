@@ -13,10 +13,10 @@ import httpx
 import pytest
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import engine
-from app.storage import Storage
-from app.usecases.tokens import create_token
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.storage import Storage
+from amers.app.usecases.tokens import create_token
 from tests.app.flat_world import make_flat_world
 from tests.app.worker_processes import ended, running_worker, scene_to_register, under_way, wait_until
 from tests.service_process import free_port
@@ -161,7 +161,7 @@ def test_tokens_expire_by_the_clock_of_the_database(
             "AMERS_DATA_FOLDER": str(settings.data_folder),
         }
     )
-    command = [sys.executable, "-m", "app.cli.main", "serve", "--no-worker", "--port", str(port)]
+    command = [sys.executable, "-m", "amers", "serve", "--no-worker", "--port", str(port)]
     quiet = subprocess.DEVNULL
     with subprocess.Popen(command, env=environment, stdout=quiet, stderr=quiet) as service:
         try:

@@ -9,14 +9,14 @@ import psycopg
 import pytest
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import engine, revisions
-from app.db.cluster import embedded
-from app.db.cluster.embedded import CREATE_DATABASE, DATABASE, ROLE, SUPERUSER, Cluster
-from app.db.sql_files import sql_file
-from app.errors import InputError
-from app.main import create_app
-from app.usecases.tokens import create_token
+from amers.app.config import Settings
+from amers.app.db import engine, revisions
+from amers.app.db.cluster import embedded
+from amers.app.db.cluster.embedded import CREATE_DATABASE, DATABASE, ROLE, SUPERUSER, Cluster
+from amers.app.db.sql_files import sql_file
+from amers.app.errors import InputError
+from amers.app.main import create_app
+from amers.app.usecases.tokens import create_token
 from tests.app.test_schema import catalogue, differences
 
 OLD_DUMP = Path(__file__).parents[1] / "golden" / "releases" / "0002.sql.gz"

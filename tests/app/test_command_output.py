@@ -8,12 +8,12 @@ import re
 import psycopg
 import pytest
 
-from app.cli.demo import LABELS
-from app.db import engine
-from app.errors import Conflict
-from app.storage import Storage
-from app.usecases.blocks.lifecycle import ingest_block, publish_block
-from app.usecases.tokens import create_token, revoke_token
+from amers.app.cli.demo import LABELS
+from amers.app.db import engine
+from amers.app.errors import Conflict
+from amers.app.storage import Storage
+from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
+from amers.app.usecases.tokens import create_token, revoke_token
 from tests.command_line import amers_here
 from tests.factories import make_block
 from tests.imports import COMMAND, LISTING, beyond_budget, imported_by

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from app.config import Settings, read_settings
-from app.errors import InputError
+from amers.app.config import Settings, read_settings
+from amers.app.errors import InputError
 
 
 @pytest.fixture(autouse=True)

@@ -10,8 +10,8 @@ import pytest
 import uvicorn
 from pydantic import ValidationError
 
-from app.api import connections
-from app.config import Settings
+from amers.app.api import connections
+from amers.app.config import Settings
 from tests.service_process import free_port
 
 PATIENCE_S = 10.0

@@ -13,14 +13,14 @@ from anyio import to_thread
 from fastapi import FastAPI
 from starlette.requests import ClientDisconnect
 
-from app.api import deps, streams
-from app.api.turns import Turns
-from app.config import Settings
-from app.db import engine
-from app.db.features import pages as features
-from app.main import create_app
-from app.storage import Storage
-from app.usecases.blocks.lifecycle import ingest_block, publish_block
+from amers.app.api import deps, streams
+from amers.app.api.turns import Turns
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.features import pages as features
+from amers.app.main import create_app
+from amers.app.storage import Storage
+from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
 from tests.factories import make_block
 
 POINTS = 60

@@ -15,17 +15,17 @@ from fastapi.testclient import TestClient
 from rasterio.transform import Affine
 from typer.testing import CliRunner
 
-from app.cli.main import app as commands
-from app.config import Settings
-from app.db.engine import Connection, Database
-from app.main import create_app
-from app.storage import Storage, trash
-from app.usecases.blocks import lifecycle
-from app.usecases.installation import Installation
-from app.usecases.jobs import do_attempt
-from app.usecases.references import NewReference, add_reference
-from app.usecases.store_verification import Verification, verify_store
-from services.formats.chips.npy_files import read_chip_file
+from amers.app.cli.main import app as commands
+from amers.app.config import Settings
+from amers.app.db.engine import Connection, Database
+from amers.app.main import create_app
+from amers.app.storage import Storage, trash
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.installation import Installation
+from amers.app.usecases.jobs import do_attempt
+from amers.app.usecases.references import NewReference, add_reference
+from amers.app.usecases.store_verification import Verification, verify_store
+from amers.services.formats.chips.npy_files import read_chip_file
 from tests.app.job_queue import claimed
 from tests.app.s3_server import running_bucket
 from tests.factories import BOX, make_block
@@ -403,7 +403,7 @@ def test_damaged_chips_are_not_served_and_alarm_the_operator(
 def test_an_archive_of_chips_ends_where_damage_begins_and_alarms_the_operator(
     filled: Filled, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("services.formats.chips.stacks.CHIPS_PER_PIECE", 16)
+    monkeypatch.setattr("amers.services.formats.chips.stacks.CHIPS_PER_PIECE", 16)
     filled.flip_chip(max(rows[-1] for rows in filled.chip_rows.values()))
     ids = ",".join(map(str, filled.chip_rows))
     whole_bytes = 101 * 101 * 2 * sum(map(len, filled.chip_rows.values()))
@@ -417,7 +417,7 @@ def test_an_archive_of_chips_ends_where_damage_begins_and_alarms_the_operator(
 @in_a_folder
 def test_a_verification_reads_no_faster_than_its_rate(filled: Filled, monkeypatch: pytest.MonkeyPatch):
     waits: list[float] = []
-    monkeypatch.setattr("app.usecases.store_verification.time.sleep", waits.append)
+    monkeypatch.setattr("amers.app.usecases.store_verification.time.sleep", waits.append)
     a_thousandth_of_a_megabyte_per_s = 0.001
     verification = verify_store(
         filled.installation, lambda fraction, key: None, a_thousandth_of_a_megabyte_per_s

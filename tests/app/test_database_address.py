@@ -6,10 +6,10 @@ import psycopg
 import pytest
 from psycopg.conninfo import conninfo_to_dict
 
-from app.cli.failures import failure
-from app.db import session
-from app.db.address import check_address, unreachable
-from app.errors import InputError
+from amers.app.cli.failures import failure
+from amers.app.db import session
+from amers.app.db.address import check_address, unreachable
+from amers.app.errors import InputError
 
 ODD = (
     *punctuation,

@@ -9,7 +9,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from app.config import Settings
+from amers.app.config import Settings
 from tests.app.flat_world import SIGMA_M, make_flat_world
 from tests.app.joint_world import SCENES, write_scenes
 from tests.app.worker_processes import wait_until

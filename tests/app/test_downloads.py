@@ -13,10 +13,10 @@ from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.api.disposition import disposition
-from app.db.engine import Database
-from app.db.jobs import attempts
-from app.storage import Storage
+from amers.app.api.disposition import disposition
+from amers.app.db.engine import Database
+from amers.app.db.jobs import attempts
+from amers.app.storage import Storage
 from tests.app.job_queue import claimed
 from tests.statements import run_sql
 

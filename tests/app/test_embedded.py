@@ -15,10 +15,10 @@ from uuid import uuid4
 import psycopg
 import pytest
 
-from app.db.cluster import binaries, embedded
-from app.db.cluster.binaries import find_binaries, server_user
-from app.db.cluster.embedded import LONGEST_SOCKET_PATH, Cluster
-from app.errors import InputError
+from amers.app.db.cluster import binaries, embedded
+from amers.app.db.cluster.binaries import find_binaries, server_user
+from amers.app.db.cluster.embedded import LONGEST_SOCKET_PATH, Cluster
+from amers.app.errors import InputError
 
 pytestmark = pytest.mark.long
 
@@ -26,7 +26,7 @@ USER = """
 import itertools, sys
 from pathlib import Path
 import psycopg
-from app.db.cluster.embedded import Cluster
+from amers.app.db.cluster.embedded import Cluster
 with Cluster(Path(sys.argv[1]), durable=False).lease() as dsn:
     for line in itertools.chain([""], sys.stdin):
         with psycopg.connect(dsn) as connection:

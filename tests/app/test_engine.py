@@ -6,12 +6,12 @@ import psycopg
 import pytest
 from sqlalchemy import QueuePool, func, select, text
 
-from app.api.deps import UPLOADS_AT_ONCE, threads_for, turns_for, upload_turns
-from app.config import Settings
-from app.db import engine
-from app.db.engine import Database
-from app.db.schema import block, token
-from app.usecases.tokens import create_token
+from amers.app.api.deps import UPLOADS_AT_ONCE, threads_for, turns_for, upload_turns
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.engine import Database
+from amers.app.db.schema import block, token
+from amers.app.usecases.tokens import create_token
 from tests.documents import ROOT
 from tests.statements import run_sql
 

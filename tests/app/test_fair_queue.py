@@ -12,14 +12,14 @@ from uuid import UUID, uuid4
 import pytest
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import engine
-from app.db.engine import Connection, Database
-from app.db.jobs import attempts, jobs, progress, queue
-from app.db.jobs.attempts import LostJob
-from app.usecases.tokens import create_token
-from app.worker.attempt import ATTEMPTS_ALLOWED
-from app.worker.sweep import sweep_jobs
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.engine import Connection, Database
+from amers.app.db.jobs import attempts, jobs, progress, queue
+from amers.app.db.jobs.attempts import LostJob
+from amers.app.usecases.tokens import create_token
+from amers.app.worker.attempt import ATTEMPTS_ALLOWED
+from amers.app.worker.sweep import sweep_jobs
 from tests.app.job_queue import LEASE_S, let_lease_lapse, tickets
 from tests.app.worker_processes import ended, running_worker, wait_until
 from tests.statements import run_sql

@@ -15,10 +15,10 @@ import pytest
 from numpy.testing import assert_allclose
 from pyogrio.raw import read as read_features
 
-from app.db import superseding
-from app.usecases.blocks import lifecycle
-from app.usecases.features import items
-from app.usecases.history import suspend_point
+from amers.app.db import superseding
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.features import items
+from amers.app.usecases.history import suspend_point
 from tests.factories import make_block
 from tests.statements import run_sql
 
@@ -170,7 +170,7 @@ def test_a_format_is_chosen_by_the_header_accept(client, bearer, made):
 def test_a_large_page_is_streamed_with_the_same_content(get, monkeypatch):
     whole = get(ITEMS, limit=50).json()
     monkeypatch.setattr(items, "LARGEST_TEXT", 10)
-    monkeypatch.setattr("app.db.features.pages.ROWS_AT_ONCE", 7)
+    monkeypatch.setattr("amers.app.db.features.pages.ROWS_AT_ONCE", 7)
     streamed = get(ITEMS, limit=50).json()
     assert streamed["features"] == whole["features"]
     for member in ("numberMatched", "numberReturned", "links"):

@@ -9,7 +9,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from app.db.cluster.embedded import Cluster
+from amers.app.db.cluster.embedded import Cluster
 from tests.app.filter_attacks import NAMED
 from tests.app.running_service import Served, service_with_a_block
 from tests.app.worker_processes import children

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 import shapely
 
-from app.db.features import cql2_process
-from app.db.features.cql2 import translate
-from app.db.features.cql2_bounds import parse_geometry, parse_json, parse_text
-from app.db.features.cql2_tokens import LONGEST_TEXT, check_text
-from app.db.features.crs import CRS84, EPSG_3857, EVERY
-from app.db.points import POINTS
-from app.errors import InvalidParameter
+from amers.app.db.features import cql2_process
+from amers.app.db.features.cql2 import translate
+from amers.app.db.features.cql2_bounds import parse_geometry, parse_json, parse_text
+from amers.app.db.features.cql2_tokens import LONGEST_TEXT, check_text
+from amers.app.db.features.crs import CRS84, EPSG_3857, EVERY
+from amers.app.db.points import POINTS
+from amers.app.errors import InvalidParameter
 from tests.app.filter_attacks import NAMED
 
 pytestmark = pytest.mark.security
@@ -114,7 +114,7 @@ def test_a_parser_has_no_file_no_secret_and_little_memory_of_the_service() -> No
 
 ORPHANS = """
 import os, signal, sys, threading, time
-from app.db.features import cql2_process
+from amers.app.db.features import cql2_process
 cql2_process.parse("text", "true")
 threading.Thread(target=cql2_process.parse, args=("text", sys.argv[1]), daemon=True).start()
 time.sleep(0.3)
@@ -139,7 +139,7 @@ def test_parsers_end_when_the_process_that_started_them_is_killed() -> None:
 
 FORKED = """
 import os
-from app.db.features import cql2_process
+from amers.app.db.features import cql2_process
 def pids():
     cql2_process.parse("text", "true")
     return {entry.process.pid for entry in cql2_process._processes if entry.process}

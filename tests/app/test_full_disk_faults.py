@@ -9,13 +9,13 @@ import psycopg
 import pytest
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import engine, revisions
-from app.db.cluster.embedded import DATABASE, SUPERUSER, Cluster
-from app.errors import is_no_room
-from app.storage import Storage
-from app.usecases.blocks import lifecycle
-from app.usecases.garbage_collection import Bin, remove_unnamed_chips
+from amers.app.config import Settings
+from amers.app.db import engine, revisions
+from amers.app.db.cluster.embedded import DATABASE, SUPERUSER, Cluster
+from amers.app.errors import is_no_room
+from amers.app.storage import Storage
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.garbage_collection import Bin, remove_unnamed_chips
 from tests.app.conftest import stored_files
 from tests.app.small_disk import Disk
 from tests.app.worker_processes import ended, running_worker

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 import uvicorn
 
-from app.api.connections import MOST_HEAD_BYTES, server_options
-from app.config import Settings
-from app.main import create_app
+from amers.app.api.connections import MOST_HEAD_BYTES, server_options
+from amers.app.config import Settings
+from amers.app.main import create_app
 from tests.service_process import free_port
 
 pytestmark = pytest.mark.security

@@ -12,34 +12,34 @@ import rasterio
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner
 
-from app.cli.main import app as amers
-from app.config import Settings
-from app.db import engine, history, registrations
-from app.db.engine import Connection, Database
-from app.db.history import NOT_ATTRIBUTABLE
-from app.db.jobs import attempts, jobs
-from app.db.jobs.attempts import LostJob
-from app.errors import Conflict, InputError, NotFound
-from app.storage import Storage
-from app.usecases.blocks.lifecycle import ingest_block, publish_block
-from app.usecases.history import (
+from amers.app.cli.main import app as amers
+from amers.app.config import Settings
+from amers.app.db import engine, history, registrations
+from amers.app.db.engine import Connection, Database
+from amers.app.db.history import NOT_ATTRIBUTABLE
+from amers.app.db.jobs import attempts, jobs
+from amers.app.db.jobs.attempts import LostJob
+from amers.app.errors import Conflict, InputError, NotFound
+from amers.app.storage import Storage
+from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
+from amers.app.usecases.history import (
     find_history,
     list_histories,
     record_measures,
     reinstate_point,
     suspend_point,
 )
-from app.usecases.registration.control_sources import points_of_block, points_of_store
-from app.usecases.registration.register import (
+from amers.app.usecases.registration.control_sources import points_of_block, points_of_store
+from amers.app.usecases.registration.register import (
     ControlSources,
     RegisteredScene,
     SceneFiles,
     run_registration,
 )
-from services.formats.block.check import check_block
-from services.registration.on_points import Registration
-from services.registration.options import RegistrationOptions
-from services.types import health
+from amers.services.formats.block.check import check_block
+from amers.services.registration.on_points import Registration
+from amers.services.registration.options import RegistrationOptions
+from amers.services.types import health
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
 from tests.app.job_queue import claim
 from tests.statements import run_sql

@@ -17,8 +17,8 @@ import uvicorn
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.main import create_app
+from amers.app.config import Settings
+from amers.app.main import create_app
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.http_world import TIFF, HttpWorld, headers_of, http_world
 from tests.app.s3_server import running_bucket

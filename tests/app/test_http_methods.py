@@ -7,8 +7,8 @@ from typing import Any
 import httpx
 import pytest
 
-from app.db.features import pages
-from app.usecases.features import items
+from amers.app.db.features import pages
+from amers.app.usecases.features import items
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.http_world import FORMATS, SITE, TIFF, TUS, HttpWorld, headers_of, http_world
 

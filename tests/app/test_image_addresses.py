@@ -19,18 +19,18 @@ import pytest
 import rasterio.shutil
 from obstore.store import S3Store
 
-from app.usecases.executors import ComputeOptions
-from app.usecases.image_production import ProductionImages, WorkPlace, _file_facts, run_production
-from app.usecases.image_selection import CatalogueRequest, run_selection
-from app.usecases.production import BlockIdentity
-from services.errors import FormatError
-from services.formats import addresses
-from services.formats.addresses import BLOCK_BYTES, Address, file_place
-from services.formats.images.raster import open_raster, write_raster
-from services.formats.images.scenes import read_scene
-from services.formats.sensor_models.rpc_text import format_rpb, format_rpc_text
-from services.imagery.scene import scene_footprint
-from services.imagery.source import Window
+from amers.app.usecases.executors import ComputeOptions
+from amers.app.usecases.image_production import ProductionImages, WorkPlace, _file_facts, run_production
+from amers.app.usecases.image_selection import CatalogueRequest, run_selection
+from amers.app.usecases.production import BlockIdentity
+from amers.services.errors import FormatError
+from amers.services.formats import addresses
+from amers.services.formats.addresses import BLOCK_BYTES, Address, file_place
+from amers.services.formats.images.raster import open_raster, write_raster
+from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.sensor_models.rpc_text import format_rpb, format_rpc_text
+from amers.services.imagery.scene import scene_footprint
+from amers.services.imagery.source import Window
 from tests.app.s3_server import running_bucket
 from tests.app.test_production_run import content, dask_cluster
 from tests.command_line import amers_here
@@ -173,8 +173,8 @@ def test_an_image_that_vanishes_gives_an_error_and_no_pixels(bucket, image, tmp_
 def test_a_process_ends_well_with_an_image_open(bucket, image) -> None:
     address = bucket.put("noise.tif", image)
     code = f"""
-from services.formats.addresses import Address
-from services.formats.images.raster import open_raster
+from amers.services.formats.addresses import Address
+from amers.services.formats.images.raster import open_raster
 image = open_raster(Address({address.url!r}))
 """
     ended = subprocess.run([sys.executable, "-c", code], env={**os.environ}, check=False)

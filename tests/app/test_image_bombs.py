@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from app.config import MEBIBYTE
+from amers.app.config import MEBIBYTE
 from tests.app.bad_images import LONG, SHORT, always, jpeg2000, rpc, tiff
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.flat_world import FlatWorld, make_flat_world

@@ -15,13 +15,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from app.db import binary_copy, engine, revisions
-from app.db.cluster.embedded import Cluster
-from app.db.metrics import read_gauges
-from app.storage import Storage
-from app.usecases.blocks import lifecycle
-from app.usecases.garbage_collection import Bin, remove_unnamed_chips
-from services.errors import FormatError
+from amers.app.db import binary_copy, engine, revisions
+from amers.app.db.cluster.embedded import Cluster
+from amers.app.db.metrics import read_gauges
+from amers.app.storage import Storage
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.garbage_collection import Bin, remove_unnamed_chips
+from amers.services.errors import FormatError
 from tests.factories import make_block
 from tests.statements import run_sql
 

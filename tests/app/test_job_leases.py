@@ -7,14 +7,14 @@ from uuid import UUID
 import pytest
 from psycopg.errors import LockNotAvailable, UniqueViolation
 
-from app.db import registrations, scenes
-from app.db.engine import Connection, Database, limit_lock_wait
-from app.db.jobs import attempts, jobs, queue
-from app.db.jobs.attempts import LostJob
-from app.db.jobs.jobs import Job
-from app.storage import Storage
-from app.worker.attempt import ATTEMPTS_ALLOWED
-from app.worker.sweep import sweep_files, sweep_jobs
+from amers.app.db import registrations, scenes
+from amers.app.db.engine import Connection, Database, limit_lock_wait
+from amers.app.db.jobs import attempts, jobs, queue
+from amers.app.db.jobs.attempts import LostJob
+from amers.app.db.jobs.jobs import Job
+from amers.app.storage import Storage
+from amers.app.worker.attempt import ATTEMPTS_ALLOWED
+from amers.app.worker.sweep import sweep_files, sweep_jobs
 from tests.app.job_queue import LEASE_S, claimed, let_lease_lapse, new_job, state_of, tickets
 from tests.statements import run_sql
 

@@ -6,14 +6,14 @@ from uuid import UUID, uuid4
 
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db.audit import list_changes
-from app.db.engine import Connection, Database
-from app.db.jobs import attempts, jobs, progress
-from app.db.jobs.jobs import Job, JobFilter
-from app.db.jobs.progress import Outlook
-from app.storage import Storage
-from app.worker.sweep import sweep_records
+from amers.app.config import Settings
+from amers.app.db.audit import list_changes
+from amers.app.db.engine import Connection, Database
+from amers.app.db.jobs import attempts, jobs, progress
+from amers.app.db.jobs.jobs import Job, JobFilter
+from amers.app.db.jobs.progress import Outlook
+from amers.app.storage import Storage
+from amers.app.worker.sweep import sweep_records
 from tests.app.job_queue import claim
 from tests.statements import run_sql
 

@@ -11,16 +11,16 @@ from uuid import UUID, uuid4
 import pytest
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import engine
-from app.db.engine import Connection, Database
-from app.db.jobs import attempts, jobs
-from app.errors import AmersError, Conflict, DamagedFile, NoSuchJob
-from app.main import create_app
-from app.storage import Storage
-from app.usecases.jobs import PROCESSES, error_details, success_message
-from services.errors import FormatError, NotEnoughPoints
-from services.formats.block.problems import BlockProblems, Problem
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.engine import Connection, Database
+from amers.app.db.jobs import attempts, jobs
+from amers.app.errors import AmersError, Conflict, DamagedFile, NoSuchJob
+from amers.app.main import create_app
+from amers.app.storage import Storage
+from amers.app.usecases.jobs import PROCESSES, error_details, success_message
+from amers.services.errors import FormatError, NotEnoughPoints
+from amers.services.formats.block.problems import BlockProblems, Problem
 from tests.app.job_queue import LEASE_S, claimed, tickets
 from tests.statements import run_sql
 

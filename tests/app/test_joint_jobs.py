@@ -13,16 +13,16 @@ from fastapi.testclient import TestClient
 from jsonschema import validate
 from rasterio.transform import from_origin
 
-from app.config import Settings
-from app.db import engine
-from app.db.engine import Database
-from app.storage import Storage
-from app.usecases.retention import remove_old_results
-from services.formats.sensor_models.rpc_files import read_rpc
-from services.formats.vector.layers import read_layer
-from services.map_grid import xy_of_lon_lat
-from services.reports.document import failure_schema
-from services.types import Frame
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.engine import Database
+from amers.app.storage import Storage
+from amers.app.usecases.retention import remove_old_results
+from amers.services.formats.sensor_models.rpc_files import read_rpc
+from amers.services.formats.vector.layers import read_layer
+from amers.services.map_grid import xy_of_lon_lat
+from amers.services.reports.document import failure_schema
+from amers.services.types import Frame
 from tests.app.flat_world import (
     CENTRE,
     GROUND_H,

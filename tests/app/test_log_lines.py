@@ -11,10 +11,10 @@ from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app import logs
-from app.cli.failures import failure
-from app.errors import InputError
-from app.printable import printable
+from amers.app import logs
+from amers.app.cli.failures import failure
+from amers.app.errors import InputError
+from amers.app.printable import printable
 
 HOSTILE = [
     "\x1b[2Jcleared",

@@ -10,18 +10,18 @@ import pytest
 from psycopg import sql
 from psycopg.conninfo import conninfo_to_dict
 
-from app.auth import Scope
-from app.config import Settings
-from app.db.cluster.embedded import SUPERUSER, Cluster
-from app.db.engine import Connection, Database
-from app.db.jobs import attempts, jobs
-from app.db.jobs.attempts import LostJob
-from app.db.jobs.jobs import Job
-from app.db.scenes import begin_upload
-from app.errors import InputError
-from app.usecases.jobs import PROCESSES, do_attempt
-from app.usecases.processes import Commit, Process, Work
-from app.worker.attempt import Attempts
+from amers.app.auth import Scope
+from amers.app.config import Settings
+from amers.app.db.cluster.embedded import SUPERUSER, Cluster
+from amers.app.db.engine import Connection, Database
+from amers.app.db.jobs import attempts, jobs
+from amers.app.db.jobs.attempts import LostJob
+from amers.app.db.jobs.jobs import Job
+from amers.app.db.scenes import begin_upload
+from amers.app.errors import InputError
+from amers.app.usecases.jobs import PROCESSES, do_attempt
+from amers.app.usecases.processes import Commit, Process, Work
+from amers.app.worker.attempt import Attempts
 from tests.app.job_queue import claimed, let_lease_lapse, new_job, state_of
 from tests.statements import run_sql
 
@@ -195,7 +195,7 @@ def test_progress_is_written_at_once_and_then_no_more_than_twice_a_second(
     database, settings, job, process, monkeypatch: pytest.MonkeyPatch
 ):
     watch = Watch()
-    monkeypatch.setattr("app.usecases.jobs.time", watch)
+    monkeypatch.setattr("amers.app.usecases.jobs.time", watch)
     shown = []
 
     def work_on(work: Work) -> None:

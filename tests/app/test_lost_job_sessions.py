@@ -13,16 +13,16 @@ import psycopg
 import pytest
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import engine
-from app.db.cluster.embedded import Cluster
-from app.db.jobs.jobs import Job
-from app.main import create_app
-from app.usecases.jobs import PROCESSES
-from app.usecases.tokens import create_token
-from app.worker.attempt import Attempts
-from app.worker.sweep import sweep_jobs
-from app.worker.warm_process import WarmProcess, WarmServer
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.cluster.embedded import Cluster
+from amers.app.db.jobs.jobs import Job
+from amers.app.main import create_app
+from amers.app.usecases.jobs import PROCESSES
+from amers.app.usecases.tokens import create_token
+from amers.app.worker.attempt import Attempts
+from amers.app.worker.sweep import sweep_jobs
+from amers.app.worker.warm_process import WarmProcess, WarmServer
 from tests.app.conftest import EMPTY_TEMPLATE
 from tests.app.flat_world import CENTRE, SIGMA_M
 from tests.app.job_queue import state_of

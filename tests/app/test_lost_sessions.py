@@ -17,14 +17,14 @@ import psycopg
 import pytest
 from psycopg import sql
 
-import app.cli
-from app.cli.commands import COMMANDS
-from app.cli.exit_status import FAILURE, REFUSED, SUCCESS
-from app.cli.on_demand import Command
-from app.db import session
-from app.db.cluster import backup
-from app.db.cluster.embedded import ROLE, SUPERUSER, Cluster
-from app.usecases.blocks import deletion
+import amers.app.cli
+from amers.app.cli.commands import COMMANDS
+from amers.app.cli.exit_status import FAILURE, REFUSED, SUCCESS
+from amers.app.cli.on_demand import Command
+from amers.app.db import session
+from amers.app.db.cluster import backup
+from amers.app.db.cluster.embedded import ROLE, SUPERUSER, Cluster
+from amers.app.usecases.blocks import deletion
 from tests.app.conftest import EMPTY_TEMPLATE, TEMPLATE
 from tests.app.session_relay import Ending, Relay, relayed
 from tests.app.store_commands import (
@@ -192,7 +192,13 @@ def test_every_command_is_tried_or_works_without_the_store():
 
 @pytest.mark.parametrize("command", sorted(WITHOUT_STORE))
 def test_a_command_without_the_store_has_no_way_to_open_it(command: str):
-    opening = {"app.cli.transaction", "app.cli.reading", "app.db.engine", "app.db.ready", "psycopg"}
+    opening = {
+        "amers.app.cli.transaction",
+        "amers.app.cli.reading",
+        "amers.app.db.engine",
+        "amers.app.db.ready",
+        "psycopg",
+    }
     *nouns, verb = command.split()
     tree = COMMANDS
     for noun in nouns:
@@ -201,18 +207,18 @@ def test_a_command_without_the_store_has_no_way_to_open_it(command: str):
     assert isinstance(entry, Command)
     module = entry.function.partition(":")[0]
     if command not in {"db verify-backup", "store trash list", "store trash restore"}:
-        assert not opening & imported_through(f"app.cli.{module}")
+        assert not opening & imported_through(f"amers.app.cli.{module}")
 
 
 def imported_through(module: str) -> set[str]:
     """What a module of commands imports, and the modules of commands that it imports."""
-    folder, found, waiting = Path(app.cli.__path__[0]), set[str](), [module]
+    folder, found, waiting = Path(amers.app.cli.__path__[0]), set[str](), [module]
     while waiting:
         path = folder / f"{waiting.pop().rpartition('.')[2]}.py"
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom) and node.module and node.module not in found:
                 found.add(node.module)
-                if node.module.startswith("app.cli."):
+                if node.module.startswith("amers.app.cli."):
                     waiting.append(node.module)
     return found
 

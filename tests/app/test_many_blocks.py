@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from psycopg.conninfo import make_conninfo
 
-from app.db.cluster.embedded import SUPERUSER
-from app.usecases.blocks import lifecycle
+from amers.app.db.cluster.embedded import SUPERUSER
+from amers.app.usecases.blocks import lifecycle
 from benchmarks._filled import ROW_BLOCKS, fill, lay_out
 from tests.factories import make_block
 

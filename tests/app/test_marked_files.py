@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import rasterio
 
-from app.errors import InputError
-from app.usecases.control_files import ControlFiles, HeightFile, read_control
-from app.usecases.marked_files import PointStatements, read_marked
-from app.usecases.terrain_file import TerrainFile
-from services.errors import FormatError, VerticalDatumError
-from services.formats.gcp.reader import StatedByCaller
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.production.control import Control
-from services.types import Acquisition
+from amers.app.errors import InputError
+from amers.app.usecases.control_files import ControlFiles, HeightFile, read_control
+from amers.app.usecases.marked_files import PointStatements, read_marked
+from amers.app.usecases.terrain_file import TerrainFile
+from amers.services.errors import FormatError, VerticalDatumError
+from amers.services.formats.gcp.reader import StatedByCaller
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.production.control import Control
+from amers.services.types import Acquisition
 from tests.services.simulated import ring_of_geometries
 
 IMAGES = [Path("one.tif"), Path("two.tif")]

@@ -12,16 +12,16 @@ import psycopg
 import pytest
 import rasterio
 
-from app.errors import is_no_memory, is_no_room
-from services.errors import FormatError
+from amers.app.errors import is_no_memory, is_no_room
+from amers.services.errors import FormatError
 
 READ_LITTLE = """
 import json, resource, sys
 import rasterio
 from rasterio.windows import Window
-from app.errors import is_no_memory
-from app.worker.warm_server import limit_memory
-from services.formats.images.datasets import as_format_error
+from amers.app.errors import is_no_memory
+from amers.app.worker.warm_server import limit_memory
+from amers.services.formats.images.datasets import as_format_error
 from pathlib import Path
 
 with rasterio.open(sys.argv[1]) as image:

@@ -13,12 +13,12 @@ from alembic.config import Config
 from alembic.script import ScriptDirectory
 from pydantic import SecretStr
 
-from app.config import Settings
-from app.db import engine, revisions
-from app.db.cluster import backup, embedded
-from app.db.revisions import SchemaStatus
-from app.errors import Conflict, InputError
-from app.usecases.tokens import create_token, list_tokens
+from amers.app.config import Settings
+from amers.app.db import engine, revisions
+from amers.app.db.cluster import backup, embedded
+from amers.app.db.revisions import SchemaStatus
+from amers.app.errors import Conflict, InputError
+from amers.app.usecases.tokens import create_token, list_tokens
 from tests.statements import run_sql
 
 TABLES = "select tablename from pg_tables where schemaname = 'public'"
@@ -67,7 +67,7 @@ def test_two_upgrades_at_once_do_the_work_of_one(empty_dsn):
         done = [
             pool.submit(
                 subprocess.run,
-                [sys.executable, "-m", "app.cli.main", "db", "upgrade"],
+                [sys.executable, "-m", "amers", "db", "upgrade"],
                 env=env,
                 check=True,
             )

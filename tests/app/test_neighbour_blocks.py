@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.errors import InputError
-from app.usecases.control_files import IMAGES_NPZ, ControlFiles, control_inputs
-from app.usecases.image_production import ProductionImages, run_production
-from app.usecases.production import BlockIdentity
-from app.usecases.registration.joined_scenes import SCENES_JSON, Member, format_scenes, read_joined
-from app.usecases.registration.register import SceneFiles
-from services.adjustment.known_images import KnownImages
-from services.errors import FormatError
-from services.formats.adjusted_images import read_adjusted_images, write_adjusted_images
-from services.formats.images.raster import write_raster
-from services.production.from_images import Production
-from services.sensors.displacement import DisplacementGrid
-from services.types import Array, Frame
+from amers.app.errors import InputError
+from amers.app.usecases.control_files import IMAGES_NPZ, ControlFiles, control_inputs
+from amers.app.usecases.image_production import ProductionImages, run_production
+from amers.app.usecases.production import BlockIdentity
+from amers.app.usecases.registration.joined_scenes import SCENES_JSON, Member, format_scenes, read_joined
+from amers.app.usecases.registration.register import SceneFiles
+from amers.services.adjustment.known_images import KnownImages
+from amers.services.errors import FormatError
+from amers.services.formats.adjusted_images import read_adjusted_images, write_adjusted_images
+from amers.services.formats.images.raster import write_raster
+from amers.services.production.from_images import Production
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.types import Array, Frame
 from tests.command_line import amers_here
 from tests.services.simulated import BLOCK_SIGMA_M, OPTIONS, block_views
 from tests.services.ties import difference_m

@@ -16,9 +16,9 @@ from fastapi.testclient import TestClient
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 from pydantic import SecretStr
 
-from app.config import Settings
-from app.db import engine
-from app.storage import Storage
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.storage import Storage
 from tests.app.flat_world import make_flat_world
 from tests.app.worker_processes import (
     alive,

@@ -9,9 +9,9 @@ from typing import Any
 import httpx
 import pytest
 
-from app.config import Settings
-from app.main import create_app
-from app.usecases.jobs import PROCESSES
+from amers.app.config import Settings
+from amers.app.main import create_app
+from amers.app.usecases.jobs import PROCESSES
 from tests.app.odd_values import Target, in_url, json_text, targets, with_member
 from tests.app.running_service import Served, service_with_a_block
 from tests.app.test_access_matrix import OPERATIONS

@@ -12,12 +12,12 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from fastapi.testclient import TestClient
 
-from app import oidc
-from app.db import engine
-from app.errors import NotAllowed
-from app.main import create_app
-from app.oidc import Identity, Issuer
-from app.usecases.tokens import revoke_token
+from amers.app import oidc
+from amers.app.db import engine
+from amers.app.errors import NotAllowed
+from amers.app.main import create_app
+from amers.app.oidc import Identity, Issuer
+from amers.app.usecases.tokens import revoke_token
 
 pytestmark = pytest.mark.security
 

@@ -17,8 +17,8 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-from app.config import Settings
-from app.main import create_app
+from amers.app.config import Settings
+from amers.app.main import create_app
 from tests.app.running_service import Served, service_with_a_block
 
 pytestmark = pytest.mark.long

@@ -9,18 +9,18 @@ import pytest
 from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
 
-from app import logs
-from app.db import engine, metrics, scenes
-from app.db.audit import list_changes
-from app.db.jobs import attempts, jobs
-from app.errors import TooLarge, TooMany
-from app.main import create_app
-from app.request_context import Origin, working_for
-from app.usecases import quotas
-from app.usecases.blocks import lifecycle
-from app.usecases.history import suspend_point
-from app.usecases.tokens import create_token
-from app.usecases.usage import read_all_usage
+from amers.app import logs
+from amers.app.db import engine, metrics, scenes
+from amers.app.db.audit import list_changes
+from amers.app.db.jobs import attempts, jobs
+from amers.app.errors import TooLarge, TooMany
+from amers.app.main import create_app
+from amers.app.request_context import Origin, working_for
+from amers.app.usecases import quotas
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.history import suspend_point
+from amers.app.usecases.tokens import create_token
+from amers.app.usecases.usage import read_all_usage
 from tests.app.job_queue import claim
 from tests.factories import make_block
 from tests.statements import run_sql

@@ -16,19 +16,19 @@ from fastapi.testclient import TestClient
 from rasterio.transform import from_origin
 from typer.testing import CliRunner
 
-from app.cli.main import app
-from app.config import Settings
-from app.db import engine, registrations, scenes
-from app.db.engine import Database
-from app.db.jobs import jobs
-from app.errors import AmersError
-from app.storage import Storage
-from app.usecases.jobs import do_attempt
-from services.formats.images.raster import write_raster
-from services.formats.sensor_models.rpc_text import format_rpc_text, parse_rpc_text
-from services.geodesy import metres_per_degree
-from services.sensors.rpc import RpcModel
-from services.types import Acquisition
+from amers.app.cli.main import app
+from amers.app.config import Settings
+from amers.app.db import engine, registrations, scenes
+from amers.app.db.engine import Database
+from amers.app.db.jobs import jobs
+from amers.app.errors import AmersError
+from amers.app.storage import Storage
+from amers.app.usecases.jobs import do_attempt
+from amers.services.formats.images.raster import write_raster
+from amers.services.formats.sensor_models.rpc_text import format_rpc_text, parse_rpc_text
+from amers.services.geodesy import metres_per_degree
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Acquisition
 from tests.app.job_queue import claim
 from tests.app.ledger import job_runner, make_token
 

@@ -10,10 +10,10 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from psycopg import sql
 
-from app.api import error_responses
-from app.db import engine
-from app.errors import InputError, StorageOutage
-from app.outages import BY_STATE, MISSING, NO_ANSWER, READ_ONLY, Outage, outage_of
+from amers.app.api import error_responses
+from amers.app.db import engine
+from amers.app.errors import InputError, StorageOutage
+from amers.app.outages import BY_STATE, MISSING, NO_ANSWER, READ_ONLY, Outage, outage_of
 
 
 def refused(dsn: str, statement: sql.Composable) -> psycopg.Error:

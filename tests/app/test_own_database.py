@@ -13,17 +13,17 @@ import psycopg
 import pytest
 from psycopg.conninfo import conninfo_to_dict
 
-from app.config import Settings
-from app.db import engine, revisions
-from app.db.cluster import backup as archive
-from app.db.cluster import programs
-from app.errors import Conflict, InputError
-from app.storage import Storage
-from app.usecases import storage_identity
-from app.usecases.backups.make import make_backup
-from app.usecases.backups.manifest import ARCHIVE
-from app.usecases.backups.restore import restore_backup
-from app.usecases.installation import Installation
+from amers.app.config import Settings
+from amers.app.db import engine, revisions
+from amers.app.db.cluster import backup as archive
+from amers.app.db.cluster import programs
+from amers.app.errors import Conflict, InputError
+from amers.app.storage import Storage
+from amers.app.usecases import storage_identity
+from amers.app.usecases.backups.make import make_backup
+from amers.app.usecases.backups.manifest import ARCHIVE
+from amers.app.usecases.backups.restore import restore_backup
+from amers.app.usecases.installation import Installation
 from tests.app.full_storage import Full, contents, run_service
 from tests.app.operators_server import PASSWORD, OperatorsServer, running_server
 from tests.app.test_schema import catalogue, differences

@@ -12,16 +12,16 @@ from psycopg import sql
 from psycopg.conninfo import conninfo_to_dict
 from pydantic import SecretStr
 
-from app.cli.failures import failure
-from app.config import Settings
-from app.db import engine, revisions
-from app.db.cluster.embedded import ROLE, SUPERUSER, Cluster
-from app.db.engine import READER
-from app.main import create_app
-from app.storage import Storage
-from app.usecases import readiness
-from app.usecases.blocks import lifecycle
-from app.usecases.tokens import create_token
+from amers.app.cli.failures import failure
+from amers.app.config import Settings
+from amers.app.db import engine, revisions
+from amers.app.db.cluster.embedded import ROLE, SUPERUSER, Cluster
+from amers.app.db.engine import READER
+from amers.app.main import create_app
+from amers.app.storage import Storage
+from amers.app.usecases import readiness
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.tokens import create_token
 from tests.factories import make_block
 
 Operator = Callable[..., None]

@@ -12,12 +12,12 @@ import pytest
 from psycopg import sql
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 
-from app.config import Settings
-from app.db import engine, session
-from app.db.cluster.embedded import ROLE, SUPERUSER, Cluster
-from app.db.revisions import driver_connection
-from app.errors import InputError
-from app.usecases import readiness
+from amers.app.config import Settings
+from amers.app.db import engine, session
+from amers.app.db.cluster.embedded import ROLE, SUPERUSER, Cluster
+from amers.app.db.revisions import driver_connection
+from amers.app.errors import InputError
+from amers.app.usecases import readiness
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.flat_world import SIGMA_M
 from tests.app.hostile_installation import Installation

@@ -11,9 +11,9 @@ from psycopg import sql
 from psycopg.conninfo import conninfo_to_dict
 from pydantic import SecretStr
 
-from app.config import Settings
-from app.db.cluster.embedded import SUPERUSER, Cluster
-from app.storage import Storage
+from amers.app.config import Settings
+from amers.app.db.cluster.embedded import SUPERUSER, Cluster
+from amers.app.storage import Storage
 from tests.app.flat_world import make_flat_world
 from tests.app.poolers import pooler
 from tests.app.worker_processes import ended, running_worker, scene_to_register, wait_until

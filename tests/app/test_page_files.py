@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from fastapi.testclient import TestClient
 
-from app.main import create_app
-from app.web import page
+from amers.app.main import create_app
+from amers.app.web import page
 
 ROOT = Path(__file__).parents[2]
 

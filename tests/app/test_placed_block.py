@@ -8,20 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.errors import InputError
-from app.usecases.blocks.frame import place_block
-from app.usecases.control_files import ControlFiles
-from app.usecases.image_production import ProductionImages, run_production
-from app.usecases.marked_files import PointStatements
-from app.usecases.production import BlockIdentity
-from services.adjustment.intersection import intersect
-from services.formats.block.check import check_block
-from services.formats.block.reader import FolderChips, read_block
-from services.formats.gcp.reader import StatedByCaller
-from services.formats.images.raster import write_raster
-from services.formats.sensor_models.rpc_text import parse_rpc_text
-from services.sensors.rpc import RpcModel
-from services.types import Array, Observations
+from amers.app.errors import InputError
+from amers.app.usecases.blocks.frame import place_block
+from amers.app.usecases.control_files import ControlFiles
+from amers.app.usecases.image_production import ProductionImages, run_production
+from amers.app.usecases.marked_files import PointStatements
+from amers.app.usecases.production import BlockIdentity
+from amers.services.adjustment.intersection import intersect
+from amers.services.formats.block.check import check_block
+from amers.services.formats.block.reader import FolderChips, read_block
+from amers.services.formats.gcp.reader import StatedByCaller
+from amers.services.formats.images.raster import write_raster
+from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Array, Observations
 from tests.command_line import amers_here
 from tests.services.production.simulated_control import CHI2_3
 from tests.services.simulated import BLOCK_SIGMA_M, OPTIONS, block_views, world

@@ -13,20 +13,20 @@ from pyproj import Transformer
 from rasterio.io import MemoryFile
 from typer.testing import CliRunner
 
-from app.cli.main import app as commands
-from app.db.features import counts
-from app.db.features import pages as features
-from app.db.features.collection import Viewer
-from app.db.features.counts import Count
-from app.db.features.query import Selection
-from app.db.points import POINTS, points_of_block
-from app.errors import InputError
-from app.usecases import history
-from app.usecases.blocks import lifecycle
-from app.usecases.features import points
-from app.usecases.features.items import COLLECTIONS, everything_in
-from app.usecases.features.query import FeatureQuery, condition_of
-from services.geodesy import east_north_up
+from amers.app.cli.main import app as commands
+from amers.app.db.features import counts
+from amers.app.db.features import pages as features
+from amers.app.db.features.collection import Viewer
+from amers.app.db.features.counts import Count
+from amers.app.db.features.query import Selection
+from amers.app.db.points import POINTS, points_of_block
+from amers.app.errors import InputError
+from amers.app.usecases import history
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.features import points
+from amers.app.usecases.features.items import COLLECTIONS, everything_in
+from amers.app.usecases.features.query import FeatureQuery, condition_of
+from amers.services.geodesy import east_north_up
 from tests.factories import make_block
 from tests.statements import run_sql
 

@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterator
 import pytest
 from typer.testing import CliRunner
 
-from app.cli.exit_status import FAILURE
-from app.cli.failures import failure
-from app.cli.main import app as commands
-from app.client import RequestRefused, ServiceFailure
-from app.client import client as client_module
-from app.errors import InputError
+from amers.app.cli.exit_status import FAILURE
+from amers.app.cli.failures import failure
+from amers.app.cli.main import app as commands
+from amers.app.client import RequestRefused, ServiceFailure
+from amers.app.client import client as client_module
+from amers.app.errors import InputError
 from tests.app.running_service import Served, service_with_a_block
 from tests.service_process import free_port
 

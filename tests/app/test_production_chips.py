@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.cli.main import main
-from services.formats.block.check import check_block
-from services.formats.block.reader import FolderChips
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.map_grid import lon_lat_of_xy, xy_of_lon_lat
-from services.registration.on_points import register_scene
-from services.sensors.ortho import OrthoModel
-from services.types import Acquisition, Array
+from amers.app.cli.main import main
+from amers.services.formats.block.check import check_block
+from amers.services.formats.block.reader import FolderChips
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.map_grid import lon_lat_of_xy, xy_of_lon_lat
+from amers.services.registration.on_points import register_scene
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Acquisition, Array
 from tests.services.chip_bases import (
     CORNER_XY,
     LAND_M,

@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.errors import InputError
-from app.usecases.control_files import ControlFiles
-from app.usecases.image_production import ProductionImages, run_production
-from app.usecases.marked_files import PointStatements
-from app.usecases.production import BlockIdentity
-from services.formats.block.reader import read_document
-from services.formats.gcp.reader import StatedByCaller
-from services.formats.images.raster import write_raster
+from amers.app.errors import InputError
+from amers.app.usecases.control_files import ControlFiles
+from amers.app.usecases.image_production import ProductionImages, run_production
+from amers.app.usecases.marked_files import PointStatements
+from amers.app.usecases.production import BlockIdentity
+from amers.services.formats.block.reader import read_document
+from amers.services.formats.gcp.reader import StatedByCaller
+from amers.services.formats.images.raster import write_raster
 from tests.services.simulated import BLOCK_SIGMA_M, OPTIONS, block_views, world
 
 pytestmark = pytest.mark.long

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import shapely
 
-from app.cli.main import main
-from app.usecases.planning import read_plan
+from amers.app.cli.main import main
+from amers.app.usecases.planning import read_plan
+from amers.services.formats.stac.catalogue import read_catalogue
+from amers.services.geodesy import metres_per_degree
 from benchmarks._catalogue import simulate_catalogue
 from benchmarks._catalogue_files import write_catalogue
-from services.formats.stac.catalogue import read_catalogue
-from services.geodesy import metres_per_degree
 
 FILES = {"points.csv", "report.html", "report.json", "manifest.json"}
 DEFAULTS = {

@@ -12,9 +12,9 @@ import rasterio
 from pyproj import Transformer
 from rasterio.transform import from_origin
 
-from app.cli.main import main
-from services.formats.block.check import check_block
-from services.types import Array
+from amers.app.cli.main import main
+from amers.services.formats.block.check import check_block
+from amers.services.types import Array
 from tests.services.textures import as_pixels, texture
 
 GSD_M = 2.0

@@ -17,14 +17,14 @@ import rasterio
 from distributed import Client
 from rasterio.transform import from_origin
 
-from app.errors import InputError
-from app.usecases.executors import ComputeOptions
-from app.usecases.ground_classes import GroundFiles
-from app.usecases.image_production import ProductionImages, WorkPlace, run_production
-from app.usecases.production import BlockIdentity
-from services.formats.block.reader import read_block
-from services.formats.images.raster import write_raster
-from services.production.from_images import Production
+from amers.app.errors import InputError
+from amers.app.usecases.executors import ComputeOptions
+from amers.app.usecases.ground_classes import GroundFiles
+from amers.app.usecases.image_production import ProductionImages, WorkPlace, run_production
+from amers.app.usecases.production import BlockIdentity
+from amers.services.formats.block.reader import read_block
+from amers.services.formats.images.raster import write_raster
+from amers.services.production.from_images import Production
 from tests.service_process import free_port
 from tests.services.simulated import BLOCK_SIGMA_M, OPTIONS, block_views, world
 
@@ -233,7 +233,7 @@ def test_work_on_other_images_is_refused(images, tmp_path) -> None:
 
 
 def test_a_cluster_that_does_not_answer_is_named(images, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("app.usecases.executors._SECONDS_TO_CONNECT", 1)
+    monkeypatch.setattr("amers.app.usecases.executors._SECONDS_TO_CONNECT", 1)
     place = WorkPlace(compute=ComputeOptions(cluster="tcp://127.0.0.1:9"))
     with pytest.raises(InputError, match=r"--cluster: tcp://127\.0\.0\.1:9: no scheduler"):
         run_production(images, tmp_path / "block", BlockIdentity("made"), OPTIONS, place=place)

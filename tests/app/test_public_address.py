@@ -15,16 +15,16 @@ import pytest
 from fastapi.routing import APIRoute
 from fastapi.testclient import TestClient
 
-from app.api.session_cookie import COOKIE
-from app.cli.api_process import log_public_address
-from app.config import Settings, read_settings
-from app.db import engine
-from app.errors import InputError
-from app.main import ROUTERS, create_app
-from app.public_url import FOLDERS, LEAVES, normal_public_url
-from app.storage import Storage
-from app.usecases.blocks import lifecycle
-from app.web import page
+from amers.app.api.session_cookie import COOKIE
+from amers.app.cli.api_process import log_public_address
+from amers.app.config import Settings, read_settings
+from amers.app.db import engine
+from amers.app.errors import InputError
+from amers.app.main import ROUTERS, create_app
+from amers.app.public_url import FOLDERS, LEAVES, normal_public_url
+from amers.app.storage import Storage
+from amers.app.usecases.blocks import lifecycle
+from amers.app.web import page
 from tests.app.ledger import job_runner
 from tests.factories import make_block
 from tests.links import POST_ALONE, kind_of, urls_of

@@ -8,14 +8,14 @@ from pathlib import Path
 import httpx
 import pytest
 
-from app.client import Client, Job, JobFailed, RequestRefused, ServiceFailure
-from app.client import client as client_module
-from app.client import upload as upload_module
-from app.client.connection import Connection
-from app.config import Settings
-from app.db import engine
-from app.storage import Storage
-from app.usecases.tokens import create_token
+from amers.app.client import Client, Job, JobFailed, RequestRefused, ServiceFailure
+from amers.app.client import client as client_module
+from amers.app.client import upload as upload_module
+from amers.app.client.connection import Connection
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.storage import Storage
+from amers.app.usecases.tokens import create_token
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.flat_world import CENTRE, SIGMA_M, FlatWorld, make_flat_world, publish_world
 from tests.app.registration_outputs import COMMON_FILES

@@ -10,15 +10,15 @@ import pytest
 from fastapi.testclient import TestClient
 from psycopg import sql
 
-from app.config import Settings
-from app.db import engine
-from app.db.cluster.embedded import SUPERUSER, Cluster
-from app.db.engine import Database
-from app.main import create_app
-from app.storage import Marker, Storage, open_storage, write_marker
-from app.usecases import readiness
-from app.usecases.installation import Installation
-from app.usecases.readiness import Readiness
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.cluster.embedded import SUPERUSER, Cluster
+from amers.app.db.engine import Database
+from amers.app.main import create_app
+from amers.app.storage import Marker, Storage, open_storage, write_marker
+from amers.app.usecases import readiness
+from amers.app.usecases.installation import Installation
+from amers.app.usecases.readiness import Readiness
 from tests.app.s3_server import KEYS
 from tests.statements import run_sql
 

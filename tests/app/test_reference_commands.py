@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.cli.main import main
-from app.config import Settings
+from amers.app.cli.main import main
+from amers.app.config import Settings
 from tests.app.test_references import GSD_M, SIZE, write
 
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from app.db import references
-from app.db.engine import Connection
-from app.db.references import NewReferenceImage, ReferenceRow
+from amers.app.db import references
+from amers.app.db.engine import Connection
+from amers.app.db.references import NewReferenceImage, ReferenceRow
 from tests.statements import run_sql
 
 SQUARE = np.array([[5.0, 43.0], [5.1, 43.0], [5.1, 43.1], [5.0, 43.1]])

@@ -12,30 +12,30 @@ import rasterio
 from fastapi.testclient import TestClient
 from rasterio.transform import Affine
 
-from app.config import Settings
-from app.db import engine, references
-from app.db.engine import Connection, Database
-from app.errors import Conflict, InputError, NotFound
-from app.main import create_app
-from app.usecases.jobs import do_attempt
-from app.usecases.references import (
+from amers.app.config import Settings
+from amers.app.db import engine, references
+from amers.app.db.engine import Connection, Database
+from amers.app.errors import Conflict, InputError, NotFound
+from amers.app.main import create_app
+from amers.app.usecases.jobs import do_attempt
+from amers.app.usecases.references import (
     NewReference,
     add_reference,
     record_places,
     references_of_store,
     remove_reference,
 )
-from app.usecases.registration.register import (
+from amers.app.usecases.registration.register import (
     ControlSources,
     RegisteredScene,
     SceneFiles,
     run_registration,
 )
-from services.errors import CoverageError
-from services.imagery.source import ArrayImage, sample_image
-from services.map_grid import MapGrid, xy_of_lon_lat
-from services.registration.options import RegistrationOptions
-from services.types import FloatImage
+from amers.services.errors import CoverageError
+from amers.services.imagery.source import ArrayImage, sample_image
+from amers.services.map_grid import MapGrid, xy_of_lon_lat
+from amers.services.registration.options import RegistrationOptions
+from amers.services.types import FloatImage
 from tests.app.job_queue import claim
 from tests.app.s3_server import running_bucket
 from tests.app.worker_processes import ended, running_worker

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from jsonschema import validate
 
-from app.config import Settings
-from app.db import engine
-from app.storage import Storage
-from services.formats.sensor_models.rpc_files import read_rpc
-from services.reports.document import failure_schema, joint_schema, report_schema
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.storage import Storage
+from amers.services.formats.sensor_models.rpc_files import read_rpc
+from amers.services.reports.document import failure_schema, joint_schema, report_schema
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
 from tests.app.joint_world import (
     A_FIFTH_OF_A_PIXEL,

@@ -14,19 +14,19 @@ from fastapi.testclient import TestClient
 from jsonschema import validate
 from rasterio.transform import Affine
 
-from app.config import Settings
-from app.storage import Storage
-from services.formats.images.raster import gdal_rpc
-from services.formats.sensor_models.correction_json import parse_correction
-from services.formats.sensor_models.rpc_files import read_rpc
-from services.reports.document import joint_schema, report_schema
-from services.sensors.correction import CorrectedModel, no_correction
-from services.sensors.displacement import DisplacementGrid
-from services.sensors.moving_pushbroom import moving_model
-from services.sensors.pushbroom import PushbroomModel
-from services.sensors.pushbroom_errors import TERMS, PushbroomErrors
-from services.simulation.orbit import pushbroom_over
-from services.types import Array
+from amers.app.config import Settings
+from amers.app.storage import Storage
+from amers.services.formats.images.raster import gdal_rpc
+from amers.services.formats.sensor_models.correction_json import parse_correction
+from amers.services.formats.sensor_models.rpc_files import read_rpc
+from amers.services.reports.document import joint_schema, report_schema
+from amers.services.sensors.correction import CorrectedModel, no_correction
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.sensors.moving_pushbroom import moving_model
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.sensors.pushbroom_errors import TERMS, PushbroomErrors
+from amers.services.simulation.orbit import pushbroom_over
+from amers.services.types import Array
 from tests.app.flat_world import (
     CENTRE,
     GROUND_H,

@@ -11,18 +11,18 @@ import pytest
 from fastapi.testclient import TestClient
 from jsonschema import validate
 
-from app.config import Settings
-from app.db import engine
-from app.db.engine import Database
-from app.db.usage import read_usage
-from app.storage import Storage
-from app.usecases.registration.control_sources import points_of_block, points_of_store
-from app.usecases.registration.register import ControlSources, SceneFiles, run_registration
-from app.usecases.results import reconcile_results
-from app.usecases.retention import remove_old_results
-from services.formats.sensor_models.rpc_files import read_rpc
-from services.sensors.correction import CorrectedModel, no_correction
-from services.sensors.refined import refined_rpc
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.engine import Database
+from amers.app.db.usage import read_usage
+from amers.app.storage import Storage
+from amers.app.usecases.registration.control_sources import points_of_block, points_of_store
+from amers.app.usecases.registration.register import ControlSources, SceneFiles, run_registration
+from amers.app.usecases.results import reconcile_results
+from amers.app.usecases.retention import remove_old_results
+from amers.services.formats.sensor_models.rpc_files import read_rpc
+from amers.services.sensors.correction import CorrectedModel, no_correction
+from amers.services.sensors.refined import refined_rpc
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
 from tests.app.registration_outputs import (
     A_TENTH_OF_A_PIXEL,

@@ -13,15 +13,15 @@ import psycopg
 import pytest
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import engine, revisions
-from app.db.cluster.embedded import SUPERUSER, Cluster
-from app.db.engine import Database
-from app.db.jobs import attempts
-from app.main import create_app
-from app.storage import Storage
-from app.usecases import storage_identity
-from app.worker.sweep import sweep_jobs
+from amers.app.config import Settings
+from amers.app.db import engine, revisions
+from amers.app.db.cluster.embedded import SUPERUSER, Cluster
+from amers.app.db.engine import Database
+from amers.app.db.jobs import attempts
+from amers.app.main import create_app
+from amers.app.storage import Storage
+from amers.app.usecases import storage_identity
+from amers.app.worker.sweep import sweep_jobs
 from tests.app.conftest import EMPTY_TEMPLATE, TEMPLATE, fresh_database
 from tests.app.full_storage import database_name
 from tests.app.job_queue import LEASE_S

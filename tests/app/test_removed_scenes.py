@@ -9,11 +9,11 @@ import pytest
 import rasterio
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db.engine import Database
-from app.usecases import scene_view
-from app.usecases.jobs import do_attempt
-from app.usecases.registration import job as registration_job
+from amers.app.config import Settings
+from amers.app.db.engine import Database
+from amers.app.usecases import scene_view
+from amers.app.usecases.jobs import do_attempt
+from amers.app.usecases.registration import job as registration_job
 from tests.app.job_queue import claimed, state_of
 
 

@@ -13,24 +13,24 @@ from fastapi.testclient import TestClient
 from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
-from app.cli.main import app as amers
-from app.config import Settings
-from app.db import engine
-from app.db.engine import Connection, Database, driver
-from app.db.jobs.attempts import LostJob
-from app.db.points import points_of_block
-from app.db.renewal import StoredSearches, find_searches
-from app.errors import Conflict
-from app.storage import Storage
-from app.usecases.blocks import lifecycle
-from app.usecases.blocks.listing import list_blocks
-from app.usecases.blocks.renewal import read_base, renew_block, stage_renewal
-from app.usecases.blocks.renewing_scenes import scene_of_image
-from app.usecases.damage import open_chips
-from app.usecases.garbage_collection import Bin, remove_unnamed_chips
-from app.usecases.history import suspend_point
-from app.usecases.registration.control_sources import points_of_store
-from app.usecases.registration.register import (
+from amers.app.cli.main import app as amers
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.engine import Connection, Database, driver
+from amers.app.db.jobs.attempts import LostJob
+from amers.app.db.points import points_of_block
+from amers.app.db.renewal import StoredSearches, find_searches
+from amers.app.errors import Conflict
+from amers.app.storage import Storage
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.blocks.listing import list_blocks
+from amers.app.usecases.blocks.renewal import read_base, renew_block, stage_renewal
+from amers.app.usecases.blocks.renewing_scenes import scene_of_image
+from amers.app.usecases.damage import open_chips
+from amers.app.usecases.garbage_collection import Bin, remove_unnamed_chips
+from amers.app.usecases.history import suspend_point
+from amers.app.usecases.registration.control_sources import points_of_store
+from amers.app.usecases.registration.register import (
     ControlSources,
     RegisteredScene,
     SceneFiles,
@@ -38,8 +38,8 @@ from app.usecases.registration.register import (
     record_registration,
     run_registration,
 )
-from services.registration.options import RegistrationOptions
-from services.types import Measures, point_chips
+from amers.services.registration.options import RegistrationOptions
+from amers.services.types import Measures, point_chips
 from tests.app.conftest import stored_files
 from tests.app.flat_world import SIGMA_M, publish_world
 from tests.app.ledger import job_runner

@@ -10,18 +10,18 @@ import pytest
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner
 
-from app.cli.main import app as amers
-from app.config import Settings
-from app.db import blocks, engine
-from app.db.engine import Database
-from app.db.points import points_of_block
-from app.storage import Storage
-from app.usecases.blocks import lifecycle
-from services.formats.block.document_json import parse_block_json
-from services.formats.block.writer import write_block
-from services.formats.images.raster import write_raster
-from services.geodesy import east_north_up
-from services.types import Array, ControlPoints, point_chips
+from amers.app.cli.main import app as amers
+from amers.app.config import Settings
+from amers.app.db import blocks, engine
+from amers.app.db.engine import Database
+from amers.app.db.points import points_of_block
+from amers.app.storage import Storage
+from amers.app.usecases.blocks import lifecycle
+from amers.services.formats.block.document_json import parse_block_json
+from amers.services.formats.block.writer import write_block
+from amers.services.formats.images.raster import write_raster
+from amers.services.geodesy import east_north_up
+from amers.services.types import Array, ControlPoints, point_chips
 from tests.app.ledger import job_runner
 from tests.factories import metadata
 from tests.services.block_with_hole import HOLE_M, PER_KM2, SIGMA_M, older, simulated

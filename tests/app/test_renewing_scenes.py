@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import rasterio
 
-from app.usecases.blocks.renewing_scenes import GoodScene, register_on_block
-from app.usecases.registration.register import SceneFiles
-from services.formats.block.check import check_block
-from services.formats.block.reader import FolderChips
-from services.types import no_progress
+from amers.app.usecases.blocks.renewing_scenes import GoodScene, register_on_block
+from amers.app.usecases.registration.register import SceneFiles
+from amers.services.formats.block.check import check_block
+from amers.services.formats.block.reader import FolderChips
+from amers.services.types import no_progress
 from tests.app.flat_world import SIGMA_M
 from tests.app.renewal_world import HALF_PX, make_years, write_scene
 

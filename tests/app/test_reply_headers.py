@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.main import create_app
+from amers.app.config import Settings
+from amers.app.main import create_app
 
 pytestmark = pytest.mark.security
 

@@ -7,7 +7,7 @@ import jsonschema
 import pytest
 from fastapi.testclient import TestClient
 
-from app.usecases.blocks import lifecycle
+from amers.app.usecases.blocks import lifecycle
 from tests.factories import make_block
 from tests.statements import run_sql
 

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from app.errors import InputError
-from app.usecases.registration import result_folder
-from app.usecases.registration.result_folder import MANIFEST, older_result, replacing
+from amers.app.errors import InputError
+from amers.app.usecases.registration import result_folder
+from amers.app.usecases.registration.result_folder import MANIFEST, older_result, replacing
 
 OPERATIONS = ("open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.listdir", "os.scandir")
 """Audit events before Python touches the file system: a kill at each of them meets every state."""
@@ -268,7 +268,7 @@ def test_a_folder_without_permission_is_refused_before_the_work(tmp_path: Path):
     code = (
         "import os, sys\n"
         "from pathlib import Path\n"
-        "from app.usecases.registration.result_folder import older_result\n"
+        "from amers.app.usecases.registration.result_folder import older_result\n"
         "if os.getuid() == 0:\n"
         "    os.setgid(65534), os.setuid(65534)\n"
         "older_result(Path(sys.argv[1]))\n"

@@ -5,17 +5,17 @@ from uuid import UUID
 import psycopg
 import pytest
 
-from app.config import Settings, read_settings
-from app.db import registrations
-from app.db.audit import list_changes
-from app.db.engine import Connection, Database
-from app.db.jobs import attempts, jobs
-from app.errors import InputError, NotFound
-from app.request_context import Origin, working_for
-from app.storage import Storage
-from app.usecases.results import result_key
-from app.usecases.tokens import create_token
-from app.worker.sweep import sweep_files, sweep_records
+from amers.app.config import Settings, read_settings
+from amers.app.db import registrations
+from amers.app.db.audit import list_changes
+from amers.app.db.engine import Connection, Database
+from amers.app.db.jobs import attempts, jobs
+from amers.app.errors import InputError, NotFound
+from amers.app.request_context import Origin, working_for
+from amers.app.storage import Storage
+from amers.app.usecases.results import result_key
+from amers.app.usecases.tokens import create_token
+from amers.app.worker.sweep import sweep_files, sweep_records
 from tests.app.job_queue import claim
 from tests.statements import run_sql
 

@@ -8,9 +8,9 @@ import pytest
 from fastapi import Request
 from fastapi.testclient import TestClient
 
-from app.api import sent_body
-from app.api.body import body_chunks
-from app.storage import Storage
+from amers.app.api import sent_body
+from amers.app.api.body import body_chunks
+from amers.app.storage import Storage
 from tests.app.conftest import stored_files
 from tests.statements import run_sql
 

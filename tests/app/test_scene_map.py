@@ -14,16 +14,16 @@ import rasterio
 from fastapi.testclient import TestClient
 from rasterio.transform import from_origin
 
-from app.config import Settings
-from app.db.engine import Database
-from app.storage import Storage
-from app.usecases.registered_scene import SceneModel
-from app.usecases.scene_map import LAYERS, MappedScene, map_scene
-from app.usecases.terrain_file import TerrainFile
-from services.formats.sensor_models.correction_json import format_correction
-from services.orthorectification.tile_limits import TILE_PX, TileLimits
-from services.sensors.correction import no_correction
-from services.types import Array
+from amers.app.config import Settings
+from amers.app.db.engine import Database
+from amers.app.storage import Storage
+from amers.app.usecases.registered_scene import SceneModel
+from amers.app.usecases.scene_map import LAYERS, MappedScene, map_scene
+from amers.app.usecases.terrain_file import TerrainFile
+from amers.services.formats.sensor_models.correction_json import format_correction
+from amers.services.orthorectification.tile_limits import TILE_PX, TileLimits
+from amers.services.sensors.correction import no_correction
+from amers.services.types import Array
 from tests.app.flat_world import (
     CENTRE,
     GROUND_H,

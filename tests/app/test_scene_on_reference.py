@@ -10,8 +10,8 @@ import pytest
 import rasterio
 from rasterio.transform import Affine
 
-from app.cli.main import main
-from services.imagery.source import ArrayImage, sample_image
+from amers.app.cli.main import main
+from amers.services.imagery.source import ArrayImage, sample_image
 
 pytestmark = pytest.mark.thorough
 

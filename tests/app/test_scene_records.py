@@ -6,12 +6,12 @@ from uuid import UUID
 
 import pytest
 
-from app.db import registrations, scenes
-from app.db.engine import Connection
-from app.db.jobs import attempts, jobs
-from app.db.scene_files import SceneFiles, read_scene_files
-from app.db.scene_registrations import SceneRegistration, last_registrations
-from app.usecases.tokens import create_token
+from amers.app.db import registrations, scenes
+from amers.app.db.engine import Connection
+from amers.app.db.jobs import attempts, jobs
+from amers.app.db.scene_files import SceneFiles, read_scene_files
+from amers.app.db.scene_registrations import SceneRegistration, last_registrations
+from amers.app.usecases.tokens import create_token
 from tests.app.job_queue import claim
 from tests.statements import run_sql
 

@@ -8,8 +8,8 @@ import numpy as np
 import rasterio
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db.engine import Database
+from amers.app.config import Settings
+from amers.app.db.engine import Database
 from tests.app.ledger import job_runner, make_token
 from tests.app.test_orthorectification import write_inputs
 

@@ -13,16 +13,16 @@ from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.config import Settings
-from app.db import engine, scenes, usage
-from app.db.engine import Connection, Database
-from app.errors import InputError, TooLarge
-from app.main import create_app
-from app.storage import KEY, Storage
-from app.usecases.installation import Installation
-from app.usecases.scenes import SentFile, clean_name, folder_of, upload_scene
-from app.usecases.tokens import create_token
-from app.worker.sweep import sweep_files
+from amers.app.config import Settings
+from amers.app.db import engine, scenes, usage
+from amers.app.db.engine import Connection, Database
+from amers.app.errors import InputError, TooLarge
+from amers.app.main import create_app
+from amers.app.storage import KEY, Storage
+from amers.app.usecases.installation import Installation
+from amers.app.usecases.scenes import SentFile, clean_name, folder_of, upload_scene
+from amers.app.usecases.tokens import create_token
+from amers.app.worker.sweep import sweep_files
 from tests.app.conftest import stored_files
 from tests.app.running_service import running_service
 from tests.app.worker_processes import wait_until

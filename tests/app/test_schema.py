@@ -7,10 +7,10 @@ import pytest
 from sqlalchemy import create_engine
 from sqlalchemy.pool import NullPool
 
-from app.db.cluster.embedded import Cluster
-from app.db.ddl import EXTENSION
-from app.db.schema import metadata
-from app.db.sql_files import sql_file
+from amers.app.db.cluster.embedded import Cluster
+from amers.app.db.ddl import EXTENSION
+from amers.app.db.schema import metadata
+from amers.app.db.sql_files import sql_file
 from tests.app.conftest import EMPTY_TEMPLATE, TEMPLATE, fresh_database
 
 # Everything that the catalogues record of the store: (what, name, definition). Objects of extensions, of

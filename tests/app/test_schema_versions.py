@@ -9,13 +9,13 @@ from typing import Any, cast
 import pytest
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import engine, revisions
-from app.db.engine import Database
-from app.db.jobs import attempts
-from app.errors import InputError
-from app.main import create_app
-from app.worker.attempt import Attempts
+from amers.app.config import Settings
+from amers.app.db import engine, revisions
+from amers.app.db.engine import Database
+from amers.app.db.jobs import attempts
+from amers.app.errors import InputError
+from amers.app.main import create_app
+from amers.app.worker.attempt import Attempts
 from tests.statements import run_sql
 
 FOREIGN = ("9999", "00001", "8f2c1d0b7a6e")
@@ -54,7 +54,7 @@ def test_an_older_schema_is_to_be_upgraded(settings: Settings, dsn: str):
 def test_the_commands_end_with_the_reason(dsn: str, tmp_path: Path, command: tuple[str, ...]):
     set_revision(dsn, "9999")
     environment = {"AMERS_DATABASE_URL": dsn, "AMERS_DATA_FOLDER": str(tmp_path), "PATH": "/usr/bin"}
-    words = [sys.executable, "-m", "app.cli.main", *command]
+    words = [sys.executable, "-m", "amers", *command]
     environment["PYTHONPATH"] = ":".join(sys.path)
     done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=90)
     assert done.returncode != 0

@@ -15,10 +15,10 @@ import httpx
 import numpy as np
 import pytest
 
-from app.db import engine
-from app.storage import Storage
-from app.usecases.blocks.lifecycle import ingest_block, publish_block
-from app.usecases.tokens import create_token
+from amers.app.db import engine
+from amers.app.storage import Storage
+from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
+from amers.app.usecases.tokens import create_token
 from tests.factories import make_block
 from tests.service_process import Service, until, users_of
 
@@ -91,7 +91,7 @@ def test_a_used_port_ends_the_service_with_the_reason(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as used:
         port = used.getsockname()[1]
         run = subprocess.run(
-            [sys.executable, "-m", "app.cli.main", "serve", "--port", str(port)],
+            [sys.executable, "-m", "amers", "serve", "--port", str(port)],
             env=os.environ | {"AMERS_DATA_FOLDER": str(tmp_path)},
             capture_output=True,
             text=True,

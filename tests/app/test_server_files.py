@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from app.errors import InputError
-from app.usecases.server_files import file_below
+from amers.app.errors import InputError
+from amers.app.usecases.server_files import file_below
 
 
 @pytest.fixture

@@ -8,10 +8,10 @@ import anyio
 import pytest
 from fastapi.testclient import TestClient
 
-from app.api import session_cookie
-from app.api.session_cookie import COOKIE, LIFETIME_S, format_session
-from app.main import create_app
-from app.usecases.features.items import page_secret
+from amers.app.api import session_cookie
+from amers.app.api.session_cookie import COOKIE, LIFETIME_S, format_session
+from amers.app.main import create_app
+from amers.app.usecases.features.items import page_secret
 from tests.statements import run_sql
 
 pytestmark = pytest.mark.security

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import engine, scenes
-from app.main import create_app
-from services.types import Acquisition
+from amers.app.config import Settings
+from amers.app.db import engine, scenes
+from amers.app.main import create_app
+from amers.services.types import Acquisition
 
 ITEMS = "/collections/scenes/items"
 TAKEN = datetime(2024, 6, 21, 10, 30, tzinfo=UTC)

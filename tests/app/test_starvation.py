@@ -14,8 +14,8 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from app.db import engine
-from app.usecases.tokens import create_token
+from amers.app.db import engine
+from amers.app.usecases.tokens import create_token
 from tests.app.bystander import Bystander, bystander
 from tests.app.running_service import Served, service_with_a_block
 from tests.factories import make_block

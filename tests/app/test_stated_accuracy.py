@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.storage import Storage
-from services.types import UNKNOWN_FRAME, Frame
+from amers.app.config import Settings
+from amers.app.storage import Storage
+from amers.services.types import UNKNOWN_FRAME, Frame
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
 from tests.app.worker_processes import ended, running_worker
 from tests.command_line import amers_here

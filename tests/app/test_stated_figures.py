@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from app.db.engine import Connection
-from app.storage import Storage
-from app.usecases.blocks import lifecycle
+from amers.app.db.engine import Connection
+from amers.app.storage import Storage
+from amers.app.usecases.blocks import lifecycle
 from tests.factories import make_block
 from tests.statements import run_sql
 
-FILL = import_module("migrations.versions.0009_stated_accuracy").FILL
+FILL = import_module("amers.migrations.versions.0009_stated_accuracy").FILL
 COLUMNS = ("relative_ce90_m", "relative_le90_m", "on_the_earth_ce90_m", "on_the_earth_le90_m")
 MATRICES = {
     "elliptical": [[9.0, 3.5, 0.2], [3.5, 2.0, 0.1], [0.2, 0.1, 25.0]],

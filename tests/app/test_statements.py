@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from sqlalchemy import bindparam, func, select
 
-from app.db.engine import driver
-from app.db.rows import among, columns_of
-from app.db.schema import block
-from app.db.statements import CopyIn, hot, named
+from amers.app.db.engine import driver
+from amers.app.db.rows import among, columns_of
+from amers.app.db.schema import block
+from amers.app.db.statements import CopyIn, hot, named
 
 APP = Path(__file__).parents[2] / "app"
 

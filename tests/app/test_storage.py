@@ -18,12 +18,12 @@ import xxhash
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.errors import DamagedFile, InputError, NotFound, TooLarge
-from app.storage import RangeReader, Storage, StoredChips, chips_key, trash
-from app.storage.content import read_content
-from app.storage.trash import Moment
-from app.usecases.garbage_collection import Bin, Family
-from services.conventions import CHIP_SIZE
+from amers.app.errors import DamagedFile, InputError, NotFound, TooLarge
+from amers.app.storage import RangeReader, Storage, StoredChips, chips_key, trash
+from amers.app.storage.content import read_content
+from amers.app.storage.trash import Moment
+from amers.app.usecases.garbage_collection import Bin, Family
+from amers.services.conventions import CHIP_SIZE
 
 
 @pytest.fixture
@@ -83,7 +83,7 @@ def test_an_upload_that_breaks_off_leaves_the_former_file(storage):
 
 def test_a_kill_while_writing_shows_no_part_of_the_file(storage):
     program = (
-        "import os, sys; from pathlib import Path; from app.storage import Storage\n"
+        "import os, sys; from pathlib import Path; from amers.app.storage import Storage\n"
         "with Storage(Path(sys.argv[1])).writing('scenes/a') as writing:\n"
         "    writing.write(b'x' * 100000); os.kill(os.getpid(), 9)"
     )
@@ -455,7 +455,7 @@ def watched_chips(tmp_path: Path) -> Iterator[StoredChips]:
 
 
 def test_the_files_that_were_read_last_stay_open_and_no_more_than_may(watched_chips, monkeypatch):
-    monkeypatch.setattr("app.storage.chips.OPEN_CHIP_FILES", 2)
+    monkeypatch.setattr("amers.app.storage.chips.OPEN_CHIP_FILES", 2)
     still_open = []
     for name in "abaca":
         watched_chips.read(f"chips/{name}.npy", 0, 1)
@@ -512,7 +512,7 @@ def test_a_file_that_is_not_of_chips_is_refused(storage, stored_chips, content):
 
 
 def test_more_files_than_may_be_open_are_read_by_many_threads(storage, stored_chips, monkeypatch):
-    monkeypatch.setattr("app.storage.chips.OPEN_CHIP_FILES", 2)
+    monkeypatch.setattr("amers.app.storage.chips.OPEN_CHIP_FILES", 2)
     for number in range(6):
         storage.put(f"chips/{number}.npy", [npy(np.full((4, CHIP_SIZE, CHIP_SIZE), number, np.uint8))])
 

@@ -8,17 +8,17 @@ from pathlib import Path
 import pytest
 from fastapi.testclient import TestClient
 
-from app import reserve
-from app.config import Settings
-from app.db import engine
-from app.db.cluster import embedded
-from app.db.cluster.embedded import DATABASE, SUPERUSER, Cluster
-from app.db.engine import Database
-from app.main import create_app
-from app.storage import Storage, trash
-from app.usecases.blocks.lifecycle import ingest_block
-from app.usecases.installation import Installation
-from app.usecases.tokens import create_token
+from amers.app import reserve
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.cluster import embedded
+from amers.app.db.cluster.embedded import DATABASE, SUPERUSER, Cluster
+from amers.app.db.engine import Database
+from amers.app.main import create_app
+from amers.app.storage import Storage, trash
+from amers.app.usecases.blocks.lifecycle import ingest_block
+from amers.app.usecases.installation import Installation
+from amers.app.usecases.tokens import create_token
 from tests.app.full_storage import finish_job
 from tests.app.small_disk import BindMount, Disk
 from tests.factories import make_block

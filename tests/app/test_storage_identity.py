@@ -11,16 +11,16 @@ from uuid import uuid4
 import httpx
 import pytest
 
-from app.cli import store_trash
-from app.config import Settings
-from app.db import engine
-from app.db.cluster.embedded import Cluster
-from app.errors import Conflict
-from app.storage import MARKER, open_storage, read_marker, trash
-from app.storage.trash import TRASH, Moment
-from app.usecases import garbage_collection, storage_identity
-from app.worker import sweep
-from app.worker.sweep import Sweeper, sweep_files
+from amers.app.cli import store_trash
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.cluster.embedded import Cluster
+from amers.app.errors import Conflict
+from amers.app.storage import MARKER, open_storage, read_marker, trash
+from amers.app.storage.trash import TRASH, Moment
+from amers.app.usecases import garbage_collection, storage_identity
+from amers.app.worker import sweep
+from amers.app.worker.sweep import Sweeper, sweep_files
 from tests.app.full_storage import FAMILIES, Full, another, contents, run_service
 from tests.app.running_service import running_service
 from tests.app.worker_processes import wait_until
@@ -274,7 +274,7 @@ def test_a_file_that_two_workers_sweep_at_once_is_moved_once(full: Full):
 def test_a_file_too_large_to_be_copied_by_the_bucket_goes_to_the_trash_in_parts(
     full: Full, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("app.storage.bucket.COPY_LIMIT_BYTES", 10)
+    monkeypatch.setattr("amers.app.storage.bucket.COPY_LIMIT_BYTES", 10)
     storage, content = unproven_storage(full.settings), bytes(range(256)) * 100
     storage.put("scenes/large", [content])
     storage.move("scenes/large", "trash/large")

@@ -13,20 +13,20 @@ import pytest
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner
 
-from app import reserve
-from app.cli.failures import failure
-from app.cli.main import app as amers
-from app.config import Settings
-from app.db import engine
-from app.db.engine import Database
-from app.db.jobs import jobs
-from app.errors import StorageOutage
-from app.main import create_app
-from app.storage import MARKER, Marker, Storage, open_storage, proof, write_marker
-from app.usecases import storage_identity
-from app.usecases.jobs import do_attempt
-from app.worker.attempt import Attempts
-from app.worker.run import main as run_attempt
+from amers.app import reserve
+from amers.app.cli.failures import failure
+from amers.app.cli.main import app as amers
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.engine import Database
+from amers.app.db.jobs import jobs
+from amers.app.errors import StorageOutage
+from amers.app.main import create_app
+from amers.app.storage import MARKER, Marker, Storage, open_storage, proof, write_marker
+from amers.app.usecases import storage_identity
+from amers.app.usecases.jobs import do_attempt
+from amers.app.worker.attempt import Attempts
+from amers.app.worker.run import main as run_attempt
 from tests.app.full_storage import finish_job
 from tests.app.s3_server import running_bucket
 from tests.factories import make_block
@@ -271,8 +271,8 @@ def test_a_process_of_a_job_tells_its_worker_that_the_storage_is_away(
 ):
     monkeypatch.setenv("AMERS_DATABASE_URL", dsn)
     monkeypatch.setenv("AMERS_DATA_FOLDER", str(settings.data_folder))
-    monkeypatch.setattr("app.worker.run.limit_memory", lambda limit: None)
-    monkeypatch.setattr("app.worker.run.limit_files", lambda limit: None)
+    monkeypatch.setattr("amers.app.worker.run.limit_memory", lambda limit: None)
+    monkeypatch.setattr("amers.app.worker.run.limit_files", lambda limit: None)
     job_id = running_job(database)
     mount.unmount()
     assert run_attempt([str(job_id), "1", str(os.getpid()), str(1 << 33)]) == 79
@@ -307,8 +307,8 @@ def test_a_storage_that_takes_no_files_says_why_and_is_read_all_the_same(
     scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()["id"]
     upload = client.post("/uploads", headers=me | ANNOUNCED).headers["location"]
     with monkeypatch.context() as patch:
-        patch.setattr("app.storage.folder.mkstemp", fail)
-        patch.setattr("app.usecases.uploads._append", fail)
+        patch.setattr("amers.app.storage.folder.mkstemp", fail)
+        patch.setattr("amers.app.usecases.uploads._append", fail)
         refused = client.post("/scenes?name=b.tif", content=TIFF, headers=me)
         piece = client.patch(upload, content=TIFF, headers=me | PIECE | {"Upload-Offset": "0"})
         for reply in (refused, piece):

@@ -14,19 +14,19 @@ import pytest
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner
 
-from app.cli.main import app
-from app.config import Settings
-from app.db import engine, usage
-from app.db.engine import Connection, Database
-from app.db.jobs import attempts, jobs
-from app.db.tokens import Token
-from app.errors import TooLarge, TooMany
-from app.storage import Storage
-from app.usecases import quotas, results, storage_identity
-from app.usecases.blocks import lifecycle
-from app.usecases.installation import Installation
-from app.usecases.scenes import SentFile, upload_scene, upload_side_file
-from app.usecases.tokens import create_token
+from amers.app.cli.main import app
+from amers.app.config import Settings
+from amers.app.db import engine, usage
+from amers.app.db.engine import Connection, Database
+from amers.app.db.jobs import attempts, jobs
+from amers.app.db.tokens import Token
+from amers.app.errors import TooLarge, TooMany
+from amers.app.storage import Storage
+from amers.app.usecases import quotas, results, storage_identity
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.installation import Installation
+from amers.app.usecases.scenes import SentFile, upload_scene, upload_side_file
+from amers.app.usecases.tokens import create_token
 from tests.app.job_queue import claim
 from tests.app.ledger import bytes_in_ledger, bytes_in_storage, job_runner, make_token
 from tests.app.s3_server import running_bucket
@@ -172,7 +172,7 @@ def test_files_beside_a_scene_count_for_its_owner(
 def test_a_scene_has_no_more_side_files_than_allowed(
     client: TestClient, admin: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("app.usecases.scenes.MOST_SIDE_FILES", 2)
+    monkeypatch.setattr("amers.app.usecases.scenes.MOST_SIDE_FILES", 2)
     scene = client.post("/scenes?name=a.tif", content=TIFF, headers=admin).json()["id"]
     statuses = [
         client.put(f"/scenes/{scene}/files/{name}.txt", content=b"", headers=admin).status_code

@@ -8,20 +8,20 @@ from uuid import UUID, uuid4
 import numpy as np
 import pytest
 
-from app.config import Settings
-from app.db import scenes, stored_files, uploads
-from app.db.engine import Connection, Database
-from app.db.jobs import attempts, jobs
-from app.db.uploads import AnnouncedFile
-from app.errors import Conflict, DamagedFile
-from app.storage import MARKER, Storage
-from app.usecases.backups.make import make_backup
-from app.usecases.backups.manifest import Manifest, write_manifest
-from app.usecases.backups.restore import restore_backup
-from app.usecases.blocks import lifecycle
-from app.usecases.damage import report_damage
-from app.usecases.installation import Installation
-from services.conventions import CHIP_SIZE
+from amers.app.config import Settings
+from amers.app.db import scenes, stored_files, uploads
+from amers.app.db.engine import Connection, Database
+from amers.app.db.jobs import attempts, jobs
+from amers.app.db.uploads import AnnouncedFile
+from amers.app.errors import Conflict, DamagedFile
+from amers.app.storage import MARKER, Storage
+from amers.app.usecases.backups.make import make_backup
+from amers.app.usecases.backups.manifest import Manifest, write_manifest
+from amers.app.usecases.backups.restore import restore_backup
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.damage import report_damage
+from amers.app.usecases.installation import Installation
+from amers.services.conventions import CHIP_SIZE
 from tests.app.job_queue import claim
 from tests.factories import make_block
 from tests.statements import run_sql

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from app.db import points as point_store
-from app.db.stored_files import find_chip_checksums
-from app.storage import StoredChips
-from app.usecases.blocks import lifecycle
-from app.usecases.blocks.export import ExportBlock, select_points, write_selected
-from services.formats.block.check import check_block
-from services.formats.block.document import rectangle
-from services.formats.block.writer import write_block
-from services.types import ControlPoints, SurfaceHeights
+from amers.app.db import points as point_store
+from amers.app.db.stored_files import find_chip_checksums
+from amers.app.storage import StoredChips
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.blocks.export import ExportBlock, select_points, write_selected
+from amers.services.formats.block.check import check_block
+from amers.services.formats.block.document import rectangle
+from amers.services.formats.block.writer import write_block
+from amers.services.types import ControlPoints, SurfaceHeights
 from tests.factories import BOX, make_block, metadata, noise_chips
 from tests.statements import run_sql
 

@@ -5,14 +5,14 @@ from uuid import UUID
 
 import pytest
 
-from app.config import Settings
-from app.db import engine
-from app.db.engine import Database
-from app.db.jobs import attempts
-from app.storage import Storage
-from app.usecases import readiness
-from app.usecases.installation import Installation
-from app.usecases.readiness import Part, Readiness
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.engine import Database
+from amers.app.db.jobs import attempts
+from amers.app.storage import Storage
+from amers.app.usecases import readiness
+from amers.app.usecases.installation import Installation
+from amers.app.usecases.readiness import Part, Readiness
 from tests.app.job_queue import LEASE_S, claimed, new_job, state_of
 from tests.statements import run_sql
 

@@ -9,25 +9,25 @@ import numpy as np
 import pytest
 from sqlalchemy import select
 
-from app.db import engine, points, superseding
-from app.db.density import AREA_KM2, DENSITY, points_in_box
-from app.db.engine import driver
-from app.db.features import pages
-from app.db.features.bbox import Box
-from app.db.points import POINTS
-from app.db.schema import density_cell
-from app.db.superseding import SAME_PLACE_M, SHORTEST_DEGREE_M
-from app.errors import Conflict, InputError
-from app.usecases import history
-from app.usecases.blocks import lifecycle
-from app.usecases.blocks.listing import list_blocks
-from app.usecases.features.items import COLLECTIONS, everything_in
-from app.usecases.features.points import points_of_filter
-from app.usecases.features.query import FeatureQuery
-from services.formats.block.document import AccuracyFigure
-from services.formats.block.writer import write_block
-from services.geodesy import metres_per_degree
-from services.types import Array
+from amers.app.db import engine, points, superseding
+from amers.app.db.density import AREA_KM2, DENSITY, points_in_box
+from amers.app.db.engine import driver
+from amers.app.db.features import pages
+from amers.app.db.features.bbox import Box
+from amers.app.db.points import POINTS
+from amers.app.db.schema import density_cell
+from amers.app.db.superseding import SAME_PLACE_M, SHORTEST_DEGREE_M
+from amers.app.errors import Conflict, InputError
+from amers.app.usecases import history
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.blocks.listing import list_blocks
+from amers.app.usecases.features.items import COLLECTIONS, everything_in
+from amers.app.usecases.features.points import points_of_filter
+from amers.app.usecases.features.query import FeatureQuery
+from amers.services.formats.block.document import AccuracyFigure
+from amers.services.formats.block.writer import write_block
+from amers.services.geodesy import metres_per_degree
+from amers.services.types import Array
 from tests.factories import BOX, control_points, metadata, noise_chips
 from tests.statements import run_sql
 

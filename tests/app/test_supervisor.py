@@ -11,7 +11,7 @@ import pytest
 PATIENCE_S = 60.0
 SUPERVISOR = """
 import logging, sys
-from app.cli.supervisor import Child, Supervisor
+from amers.app.cli.supervisor import Child, Supervisor
 logging.basicConfig(level="INFO")
 supervisor = Supervisor()
 children = [
@@ -108,7 +108,7 @@ def test_a_process_that_does_not_listen_is_killed_after_its_time(tmp_path):
 @pytest.mark.long
 def test_the_supervisor_imports_neither_the_server_nor_the_science():
     program = (
-        "import sys, app.cli.serve;"
+        "import sys, amers.app.cli.serve;"
         "print(*{'fastapi', 'uvicorn', 'numpy', 'rasterio', 'cql2'} & set(sys.modules))"
     )
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

@@ -17,24 +17,24 @@ import psycopg
 import pytest
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import blocks, engine, scenes, uptime
-from app.db.engine import Database
-from app.db.jobs import attempts, jobs
-from app.db.tokens import list_tokens
-from app.db.uploads import LIFE_HOURS
-from app.storage import Marker, Storage, read_marker, trash, write_marker
-from app.usecases import garbage_collection, storage_identity
-from app.usecases.blocks import lifecycle
-from app.usecases.garbage_collection import (
+from amers.app.config import Settings
+from amers.app.db import blocks, engine, scenes, uptime
+from amers.app.db.engine import Database
+from amers.app.db.jobs import attempts, jobs
+from amers.app.db.tokens import list_tokens
+from amers.app.db.uploads import LIFE_HOURS
+from amers.app.storage import Marker, Storage, read_marker, trash, write_marker
+from amers.app.usecases import garbage_collection, storage_identity
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.garbage_collection import (
     FILES_AT_ONCE,
     Bin,
     Family,
     moment,
     remove_all_unnamed,
 )
-from app.worker import sweep
-from app.worker.sweep import MOST_BETWEEN_S, Sweeper, sweep_files, sweep_records
+from amers.app.worker import sweep
+from amers.app.worker.sweep import MOST_BETWEEN_S, Sweeper, sweep_files, sweep_records
 from tests.app.point_history import jump, let_pass
 from tests.factories import make_block
 from tests.statements import run_sql
@@ -46,7 +46,7 @@ TUS = {"Tus-Resumable": "1.0.0", "Content-Type": "application/offset+octet-strea
 WRITER = """
 import sys
 from pathlib import Path
-from app.storage import Storage
+from amers.app.storage import Storage
 storage = Storage(Path(sys.argv[1]))
 with storage.writing("kept/a") as file, storage.scratch_folder("job-") as folder:
     (folder / "part").write_bytes(b"x")

@@ -9,7 +9,7 @@ from uuid import uuid4
 
 import pytest
 
-from app.auth import (
+from amers.app.auth import (
     Scope,
     allows,
     authenticate,
@@ -19,10 +19,10 @@ from app.auth import (
     owner_filter,
     require,
 )
-from app.db import engine, tokens
-from app.db.jobs import jobs
-from app.errors import Conflict, InputError, NotAllowed, NotFound
-from app.usecases.tokens import create_token, list_tokens, revoke_token
+from amers.app.db import engine, tokens
+from amers.app.db.jobs import jobs
+from amers.app.errors import Conflict, InputError, NotAllowed, NotFound
+from amers.app.usecases.tokens import create_token, list_tokens, revoke_token
 from tests.statements import run_sql
 
 pytestmark = pytest.mark.security
@@ -284,5 +284,5 @@ def test_on_the_command_line_a_secret_stands_alone_on_its_line(dsn):
 
 def amers(dsn: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
     environment = {**os.environ, "AMERS_DATABASE_URL": dsn}
-    command = [sys.executable, "-m", "app.cli.main", *arguments]
+    command = [sys.executable, "-m", "amers", *arguments]
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)

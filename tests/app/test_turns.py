@@ -11,15 +11,15 @@ import pytest
 from anyio import create_task_group, wait_all_tasks_blocked
 from starlette.exceptions import HTTPException
 
-from app.api import deps, streams
-from app.api.open_connections import network_of
-from app.api.turns import Turns
-from app.config import Settings
-from app.db import engine
-from app.db.features import pages as features
-from app.main import create_app
-from app.storage import Storage
-from app.usecases.blocks.lifecycle import ingest_block, publish_block
+from amers.app.api import deps, streams
+from amers.app.api.open_connections import network_of
+from amers.app.api.turns import Turns
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.features import pages as features
+from amers.app.main import create_app
+from amers.app.storage import Storage
+from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
 from tests.factories import make_block
 
 PATIENCE_S = 30.0

@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import pytest
 
-from app.db.blocks import ID_BITS
-from app.usecases import history
-from app.usecases.blocks import lifecycle
+from amers.app.db.blocks import ID_BITS
+from amers.app.usecases import history
+from amers.app.usecases.blocks import lifecycle
 from tests.factories import make_block
 
 pytestmark = pytest.mark.security

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from app.json_values import unusable_body, unusable_value
-from app.usecases.jobs import PROCESSES
+from amers.app.json_values import unusable_body, unusable_value
+from amers.app.usecases.jobs import PROCESSES
 
 JSON = {"Content-Type": "application/json"}
 TIFF = b"II*\0" + bytes(100)

@@ -15,10 +15,10 @@ import httpx
 import pytest
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import engine
-from app.main import create_app
-from app.storage import Storage
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.main import create_app
+from amers.app.storage import Storage
 from tests.app.s3_server import running_bucket
 from tests.app.worker_processes import wait_until
 from tests.service_process import free_port
@@ -195,7 +195,7 @@ def killed_service(settings: Settings, log: Path) -> Iterator[str]:
         "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
         "AMERS_DATA_FOLDER": str(settings.data_folder),
     }
-    command = [sys.executable, "-m", "app.cli.main", "serve", "--no-worker", "--port", str(port)]
+    command = [sys.executable, "-m", "amers", "serve", "--no-worker", "--port", str(port)]
     with log.open("wb") as output:
         service = subprocess.Popen(
             command, env=environment, stdout=output, stderr=output, start_new_session=True
@@ -223,7 +223,7 @@ def test_a_scene_whose_commit_fails_leaves_nothing_and_can_be_sent_again(
 def test_a_scene_keeps_its_image_when_the_confirmation_of_its_commit_is_lost(
     client: TestClient, bearer: Bearer, storage: Storage, monkeypatch: pytest.MonkeyPatch
 ):
-    from app.db import scenes
+    from amers.app.db import scenes
 
     me = bearer("register")
     database = client.app.state.database  # type: ignore[attr-defined]

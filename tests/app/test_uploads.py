@@ -22,19 +22,19 @@ import uvicorn
 from fastapi.testclient import TestClient
 from tusclient.client import TusClient
 
-from app.config import Settings
-from app.db import engine
-from app.db import uploads as upload_rows
-from app.db.engine import Connection
-from app.db.tokens import list_tokens
-from app.db.uploads import LIFE_HOURS
-from app.errors import Conflict, InputError, NotFound
-from app.main import create_app
-from app.storage import Storage
-from app.usecases.blocks.uploads import find_uploaded_block
-from app.usecases.scenes import SIDE_FILE_LIMIT_BYTES
-from app.usecases.uploads import UPLOAD_PREFIX, remove_abandoned_uploads
-from app.worker.sweep import sweep_files
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db import uploads as upload_rows
+from amers.app.db.engine import Connection
+from amers.app.db.tokens import list_tokens
+from amers.app.db.uploads import LIFE_HOURS
+from amers.app.errors import Conflict, InputError, NotFound
+from amers.app.main import create_app
+from amers.app.storage import Storage
+from amers.app.usecases.blocks.uploads import find_uploaded_block
+from amers.app.usecases.scenes import SIDE_FILE_LIMIT_BYTES
+from amers.app.usecases.uploads import UPLOAD_PREFIX, remove_abandoned_uploads
+from amers.app.worker.sweep import sweep_files
 from tests.app.conftest import stored_files
 from tests.app.ledger import bytes_in_ledger, bytes_in_storage, make_token
 from tests.app.point_history import let_pass

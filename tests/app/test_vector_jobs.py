@@ -10,14 +10,14 @@ import pytest
 import shapely
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import registrations
-from app.db.engine import Database
-from app.db.jobs import jobs
-from app.storage import Storage
-from services.formats.vector.layers import read_layer
-from services.map_grid import xy_of_lon_lat
-from services.types import Frame
+from amers.app.config import Settings
+from amers.app.db import registrations
+from amers.app.db.engine import Database
+from amers.app.db.jobs import jobs
+from amers.app.storage import Storage
+from amers.services.formats.vector.layers import read_layer
+from amers.services.map_grid import xy_of_lon_lat
+from amers.services.types import Frame
 from tests.app.ledger import job_runner, make_token
 from tests.app.test_orthorectification import in_the_image, write_inputs
 from tests.app.test_vectors import UTM, a_millimetre, drawn, on_ground, registered

@@ -12,16 +12,16 @@ import shapely
 from rasterio.transform import from_origin
 from typer.testing import CliRunner
 
-from app.cli.main import app
-from app.errors import AmersError
-from services.formats.sensor_models.correction_json import format_correction
-from services.formats.sensor_models.rpc_text import format_rpc_text
-from services.formats.vector.layers import VectorLayer, read_layer, write_layer
-from services.geodesy import metres_per_degree
-from services.map_grid import xy_of_lon_lat
-from services.sensors.correction import no_correction
-from services.sensors.rpc import RpcModel
-from services.types import Frame
+from amers.app.cli.main import app
+from amers.app.errors import AmersError
+from amers.services.formats.sensor_models.correction_json import format_correction
+from amers.services.formats.sensor_models.rpc_text import format_rpc_text
+from amers.services.formats.vector.layers import VectorLayer, read_layer, write_layer
+from amers.services.geodesy import metres_per_degree
+from amers.services.map_grid import xy_of_lon_lat
+from amers.services.sensors.correction import no_correction
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Frame
 from tests.app.test_orthorectification import MODEL, in_the_image, write_inputs
 
 a_millimetre = 1e-3

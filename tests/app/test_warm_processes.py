@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from app.worker.warm_process import WarmProcess, WarmServer
+from amers.app.worker.warm_process import WarmProcess, WarmServer
 from tests.app.worker_processes import alive, kill, wait_until
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
@@ -22,7 +22,7 @@ HERE = {"PYTHONPATH": os.getcwd()}
 FUNCTIONS = "tests.app.warm_functions"
 LONELY = """
 import os, sys, time
-from app.worker.warm_process import WarmServer
+from amers.app.worker.warm_process import WarmServer
 server = WarmServer({"PYTHONPATH": os.getcwd()})
 process = server.start("tests.app.warm_functions:sleep_with_a_child", [sys.argv[1]], {})
 time.sleep(600)

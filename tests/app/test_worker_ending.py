@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from app.config import Settings
+from amers.app.config import Settings
 from tests.app.worker_processes import wait_until
 
 PATIENCE_S = 60
 STUBBORN = """
 import asyncio, procrastinate
-from app.config import read_settings
-from app.worker.main import run_worker
+from amers.app.config import read_settings
+from amers.app.worker.main import run_worker
 
 run = procrastinate.App.run_worker_async
 
@@ -40,9 +40,9 @@ run_worker(read_settings())
 
 STUCK = """
 import sys, threading
-import app.worker.main as main
-from app.config import read_settings
-from app.worker.sweep import Sweeper
+import amers.app.worker.main as main
+from amers.app.config import read_settings
+from amers.app.worker.sweep import Sweeper
 
 def sweep(self):
     print("waits", flush=True)

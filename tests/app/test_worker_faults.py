@@ -12,11 +12,11 @@ import rasterio
 from fastapi.testclient import TestClient
 from rasterio.windows import Window
 
-from app.config import Settings
-from app.db import engine
-from app.db.jobs import jobs
-from app.main import create_app
-from app.storage import Storage
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.jobs import jobs
+from amers.app.main import create_app
+from amers.app.storage import Storage
 from tests.app.flat_world import FlatWorld, make_flat_world
 from tests.app.worker_processes import (
     alive,

@@ -14,11 +14,11 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-from app.db import engine
-from app.db.cluster.embedded import Cluster
-from app.storage import MARKER, Storage
-from app.usecases.blocks.lifecycle import ingest_block
-from app.usecases.tokens import create_token
+from amers.app.db import engine
+from amers.app.db.cluster.embedded import Cluster
+from amers.app.storage import MARKER, Storage
+from amers.app.usecases.blocks.lifecycle import ingest_block
+from amers.app.usecases.tokens import create_token
 from tests.app.conftest import EMPTY_TEMPLATE, TEMPLATE, fresh_database
 from tests.command_line import Done, amers_here
 from tests.factories import make_block

@@ -63,6 +63,6 @@ def _target(name: str) -> str:
 
 
 def _kernels_loaded() -> bool:
-    from services.sensors import rpc
+    from amers.services.sensors import rpc
 
     return bool(rpc._project.signatures) and bool(rpc._locate.signatures)

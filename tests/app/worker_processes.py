@@ -12,8 +12,8 @@ from typing import Any
 
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.storage import Storage
+from amers.app.config import Settings
+from amers.app.storage import Storage
 from tests.app.flat_world import SIGMA_M, FlatWorld, publish_world
 
 PATIENCE_S = 240.0
@@ -42,7 +42,7 @@ def running_worker(
     }
     with log.open("ab") as output:
         worker = subprocess.Popen(
-            [*prefix, sys.executable, "-m", "app.cli.main", "worker"],
+            [*prefix, sys.executable, "-m", "amers", "worker"],
             env=environment,
             stdin=subprocess.DEVNULL,
             stdout=output,

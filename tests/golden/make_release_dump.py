@@ -26,16 +26,16 @@ from fastapi.testclient import TestClient
 from pydantic import SecretStr
 from rasterio.transform import Affine
 
-from app.config import Settings
-from app.db import engine, revisions
-from app.db.cluster.binaries import find_binaries
-from app.db.cluster.embedded import Cluster
-from app.db.jobs import attempts
-from app.db.tokens import keep_subject
-from app.main import create_app
-from app.storage import open_storage
-from app.usecases.blocks.lifecycle import ingest_block, publish_block, withdraw_block
-from app.usecases.tokens import create_token
+from amers.app.config import Settings
+from amers.app.db import engine, revisions
+from amers.app.db.cluster.binaries import find_binaries
+from amers.app.db.cluster.embedded import Cluster
+from amers.app.db.jobs import attempts
+from amers.app.db.tokens import keep_subject
+from amers.app.main import create_app
+from amers.app.storage import open_storage
+from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block, withdraw_block
+from amers.app.usecases.tokens import create_token
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
 from tests.factories import make_block
 
@@ -101,7 +101,7 @@ class Installation:
             "AMERS_DATABASE_URL": self.dsn,
             "AMERS_DATA_FOLDER": str(self.settings.data_folder),
         }
-        process = subprocess.Popen([sys.executable, "-m", "app.cli.main", "worker"], env=environment)
+        process = subprocess.Popen([sys.executable, "-m", "amers", "worker"], env=environment)
         try:
             yield
         finally:

@@ -19,7 +19,7 @@ from playwright.sync_api import (
     sync_playwright,
 )
 
-from app.db.cluster.embedded import Cluster
+from amers.app.db.cluster.embedded import Cluster
 from tests.app.flat_world import CENTRE, GROUND_H, FlatWorld, make_flat_world
 from tests.command_line import amers_here
 from tests.journeys.map_page import ARTEFACTS, BUILT, DESKTOP, is_error, patience_ms

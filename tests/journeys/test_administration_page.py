@@ -8,8 +8,8 @@ import pytest
 import rasterio
 from playwright.sync_api import Locator, Page, expect
 
-from app.db import engine
-from app.db.cluster.embedded import DATABASE
+from amers.app.db import engine
+from amers.app.db.cluster.embedded import DATABASE
 from tests.factories import make_block
 from tests.journeys.map_page import ARTEFACTS, PHONE, WIDE, assert_readable, hold, tab_to, until_held
 from tests.service_process import Service

@@ -13,8 +13,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from services.formats.block.reader import file_sha256
-from services.formats.sensor_models.rpc_text import format_rpc_text, parse_rpc_text
+from amers.services.formats.block.reader import file_sha256
+from amers.services.formats.sensor_models.rpc_text import format_rpc_text, parse_rpc_text
 from tests.app.flat_world import FlatWorld, make_flat_world
 from tests.service_process import Service
 
@@ -166,7 +166,7 @@ def test_a_block_that_contradicts_its_document_is_refused_completely(
     spoil(block)
     before = store()
     refused = subprocess.run(
-        [sys.executable, "-m", "app.cli.main", "block", "ingest", str(block), "--publish"],
+        [sys.executable, "-m", "amers", "block", "ingest", str(block), "--publish"],
         env=service.environment,
         capture_output=True,
         text=True,

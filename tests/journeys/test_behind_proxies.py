@@ -26,8 +26,8 @@ from playwright.sync_api import Browser, expect
 from pystac_client import Client as Catalog
 from tusclient.client import TusClient
 
-from app.api.connect import RECIPES
-from app.client import Client
+from amers.app.api.connect import RECIPES
+from amers.app.client import Client
 from tests.app.flat_world import SIGMA_M, FlatWorld
 from tests.journeys.map_page import registered, until_drawn
 from tests.links import POST_ALONE, kind_of, urls_of

@@ -7,18 +7,18 @@ import cv2
 import numpy as np
 import pytest
 
-from app.usecases.image_production import ProductionImages, run_production
-from app.usecases.production import BlockIdentity
-from services.formats.block.check import check_block
-from services.formats.block.reader import FolderChips
-from services.formats.images.scenes import read_scene
-from services.formats.sensor_models.rpc_text import parse_rpc_text
-from services.imagery.scene import Scene, scene_gsd_m
-from services.imagery.source import Window
-from services.production.from_images import ProductionOptions
-from services.registration.on_points import register_scene
-from services.sensors.base import SensorModel
-from services.types import Array, FloatImage
+from amers.app.usecases.image_production import ProductionImages, run_production
+from amers.app.usecases.production import BlockIdentity
+from amers.services.formats.block.check import check_block
+from amers.services.formats.block.reader import FolderChips
+from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
+from amers.services.imagery.scene import Scene, scene_gsd_m
+from amers.services.imagery.source import Window
+from amers.services.production.from_images import ProductionOptions
+from amers.services.registration.on_points import register_scene
+from amers.services.sensors.base import SensorModel
+from amers.services.types import Array, FloatImage
 
 pytestmark = [pytest.mark.real_data, pytest.mark.thorough]
 

@@ -8,15 +8,15 @@ import pytest
 import rasterio
 from scipy.spatial import cKDTree
 
-from services.formats.images.scenes import read_scene
-from services.geodesy import east_north_up
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, Window
-from services.matching.reference_image import Reference
-from services.production.from_images import Production, ProductionOptions, produce_points
-from services.registration.on_points import Registration, register_scene
-from services.registration.on_reference import register_on_reference
-from services.types import ControlPoints
+from amers.services.formats.images.scenes import read_scene
+from amers.services.geodesy import east_north_up
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, Window
+from amers.services.matching.reference_image import Reference
+from amers.services.production.from_images import Production, ProductionOptions, produce_points
+from amers.services.registration.on_points import Registration, register_scene
+from amers.services.registration.on_reference import register_on_reference
+from amers.services.types import ControlPoints
 from tests.services.simulated import MemoryChips
 
 pytestmark = [pytest.mark.long, pytest.mark.real_data, pytest.mark.thorough]

@@ -13,8 +13,8 @@ from uuid import uuid4
 import pyarrow.parquet
 import pytest
 
-from services.formats.sensor_models.rpc_files import read_rpc
-from services.formats.sensor_models.rpc_text import format_rpb
+from amers.services.formats.sensor_models.rpc_files import read_rpc
+from amers.services.formats.sensor_models.rpc_text import format_rpb
 from tests.command_line import Done, amers_here, amers_process
 from tests.documents import blocks_of
 from tests.service_process import Service, until
@@ -142,9 +142,7 @@ def first_run(demo, open_folder) -> Iterator[tuple[Service, Path, dict[str, str]
         for line in lines:
             command = line.split("#")[0].split()
             assert command[0] == "amers"
-            printed[command[2]] = run(
-                [sys.executable, "-m", "app.cli.main", *command[1:]], service, folder
-            )
+            printed[command[2]] = run([sys.executable, "-m", "amers", *command[1:]], service, folder)
         yield service, folder, printed
     finally:
         service.end()
@@ -171,7 +169,7 @@ def reader(first_run) -> tuple[Service, Path]:
         (folder / name).symlink_to(folder / "demo-output" / place)
     (folder / "scene.RPB").write_text(format_rpb(read_rpc(folder / "scene.tif").model))
     token = ["token", "create", uuid4().hex, "--scope", "register"]
-    secret = run([sys.executable, "-m", "app.cli.main", *token], service, folder).strip()
+    secret = run([sys.executable, "-m", "amers", *token], service, folder).strip()
     service.environment["TOKEN"] = secret
     return service, folder
 

@@ -14,7 +14,7 @@ import pytest
 from matplotlib.image import imread, imsave
 from playwright.sync_api import Browser, Page, Route, expect
 
-from app.db.cluster.embedded import DATABASE
+from amers.app.db.cluster.embedded import DATABASE
 from tests.app.flat_world import FlatWorld
 from tests.factories import make_block
 from tests.journeys.map_page import ARTEFACTS, PHONE, WIDE, assert_readable, tab_to, until_drawn

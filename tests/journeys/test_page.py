@@ -14,7 +14,7 @@ import shapely
 from matplotlib.image import imread
 from playwright.sync_api import Locator, Page, Request, Route, expect
 
-from services.geodesy import metres_per_degree
+from amers.services.geodesy import metres_per_degree
 from tests.app.flat_world import CENTRE, GROUND_H, GSD_M
 from tests.factories import make_block
 from tests.journeys.map_page import (

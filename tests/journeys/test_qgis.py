@@ -23,9 +23,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from amers.services.conventions import STATUS_COLOURS
+from amers.services.formats.vector.qgis_styles import COLOURS
 from scripts.make_plugin import write_plugin
-from services.conventions import STATUS_COLOURS
-from services.formats.vector.qgis_styles import COLOURS
 from tests.app.flat_world import CENTRE, GROUND_H, SIGMA_M, FlatWorld, make_flat_world
 from tests.service_process import Service, free_port
 

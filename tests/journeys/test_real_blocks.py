@@ -7,16 +7,16 @@ import pytest
 from numpy.testing import assert_allclose
 from typer.testing import CliRunner
 
-from app.cli.main import app as commands
-from app.usecases.blocks.quality import (
+from amers.app.cli.main import app as commands
+from amers.app.usecases.blocks.quality import (
     HeightFiles,
     QualityReferences,
     RequiredQuality,
     SiteFile,
     assess_folder,
 )
-from app.usecases.production import BlockIdentity, OrthoFiles, run_ortho_production
-from app.usecases.terrain_file import TerrainFile
+from amers.app.usecases.production import BlockIdentity, OrthoFiles, run_ortho_production
+from amers.app.usecases.terrain_file import TerrainFile
 
 pytestmark = [pytest.mark.long, pytest.mark.real_data, pytest.mark.thorough]
 

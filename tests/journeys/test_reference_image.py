@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from services.formats.images.raster import map_grid_of, open_raster
-from services.imagery.scene import Scene
-from services.imagery.source import ImageSource, Window
-from services.matching.reference_image import Reference
-from services.registration.on_points import Registration
-from services.registration.on_reference import register_on_reference
-from services.sensors.ortho import OrthoModel
-from services.types import Acquisition, Array, FloatImage
+from amers.services.formats.images.raster import map_grid_of, open_raster
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ImageSource, Window
+from amers.services.matching.reference_image import Reference
+from amers.services.registration.on_points import Registration
+from amers.services.registration.on_reference import register_on_reference
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Acquisition, Array, FloatImage
 
 pytestmark = [pytest.mark.real_data, pytest.mark.thorough]
 

@@ -13,8 +13,8 @@ from pystac.validation import validate_dict
 from pystac_client import Client
 from shapely.geometry import box, mapping, shape
 
-from app.usecases.features.stac import RESULTS
-from app.usecases.registration.deliverables import OUTPUTS
+from amers.app.usecases.features.stac import RESULTS
+from amers.app.usecases.registration.deliverables import OUTPUTS
 from tests.app.flat_world import CENTRE, SIGMA_M, FlatWorld, make_flat_world
 from tests.service_process import Service, until
 

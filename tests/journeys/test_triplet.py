@@ -6,18 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.adjustment.intersection import intersect
-from services.formats.images.raster import open_raster, write_raster
-from services.formats.images.scenes import read_scene
-from services.formats.sensor_models.rpc_files import read_rpc
-from services.formats.sensor_models.rpc_text import parse_rpc_text
-from services.imagery.scene import scene_gsd_m
-from services.imagery.source import ArrayImage, Window
-from services.production.from_images import ProductionOptions, produce_points
-from services.registration.on_points import register_scene
-from services.sensors.base import SensorModel
-from services.sensors.correction import ImageCorrection, fold_into_rpc, no_correction
-from services.sensors.rpc import RpcModel
+from amers.services.adjustment.intersection import intersect
+from amers.services.formats.images.raster import open_raster, write_raster
+from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.sensor_models.rpc_files import read_rpc
+from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
+from amers.services.imagery.scene import scene_gsd_m
+from amers.services.imagery.source import ArrayImage, Window
+from amers.services.production.from_images import ProductionOptions, produce_points
+from amers.services.registration.on_points import register_scene
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.correction import ImageCorrection, fold_into_rpc, no_correction
+from amers.services.sensors.rpc import RpcModel
 from tests.journeys.ties import independent_tracks
 from tests.services.simulated import MemoryChips
 

@@ -6,8 +6,8 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from services.matching.ground_features import FeatureOptions
-from services.types import Array, FloatImage, Observations
+from amers.services.matching.ground_features import FeatureOptions
+from amers.services.types import Array, FloatImage, Observations
 
 LARGEST_PX = 12.0
 

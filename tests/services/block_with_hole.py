@@ -7,17 +7,17 @@ from functools import cache
 
 import numpy as np
 
-from services.adjustment.intersection import intersect
-from services.geodesy import box_around, east_north_up, move_metres
-from services.imagery.scene import Scene
-from services.matching.multi_image import refine_on_chips
-from services.production.control_points import ControlBlock
-from services.production.from_images import Production, produce_points
-from services.sensors.base import SensorModel
-from services.simulation.orbit import sun_direction
-from services.simulation.render import Radiometry
-from services.simulation.view import SimulatedView, render_view, simulate_block
-from services.types import Array, ControlPoints, Frame
+from amers.services.adjustment.intersection import intersect
+from amers.services.geodesy import box_around, east_north_up, move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.matching.multi_image import refine_on_chips
+from amers.services.production.control_points import ControlBlock
+from amers.services.production.from_images import Production, produce_points
+from amers.services.sensors.base import SensorModel
+from amers.services.simulation.orbit import sun_direction
+from amers.services.simulation.render import Radiometry
+from amers.services.simulation.view import SimulatedView, render_view, simulate_block
+from amers.services.types import Array, ControlPoints, Frame
 from tests.services.simulated import GSD_M, OPTIONS, SHAPE, MemoryChips, world
 
 SIGMA_M = 5.0

@@ -11,8 +11,8 @@ import rasterio
 from rasterio.transform import from_origin
 from scipy.ndimage import map_coordinates, spline_filter
 
-from services.map_grid import MapGrid, lon_lat_of_xy, xy_of_lon_lat
-from services.types import Array
+from amers.services.map_grid import MapGrid, lon_lat_of_xy, xy_of_lon_lat
+from amers.services.types import Array
 from tests.services.textures import texture
 
 UTM = "EPSG:32633"

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from services.adjustment.control_observations import ControlObservations
-from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
-from services.quality.stability import AdjustedScene
-from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
-from services.types import UNKNOWN_FRAME, Array, BoolArray, Frame, Measures
+from amers.services.adjustment.control_observations import ControlObservations
+from amers.services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
+from amers.services.quality.stability import AdjustedScene
+from amers.services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
+from amers.services.types import UNKNOWN_FRAME, Array, BoolArray, Frame, Measures
 
 SHAPE = (4000, 5000)
 GSD_M = 0.5

@@ -6,8 +6,8 @@ from functools import cache
 
 import numpy as np
 
-from services.production.from_images import Production, ProductionOptions, produce_points
-from services.simulation.view import (
+from amers.services.production.from_images import Production, ProductionOptions, produce_points
+from amers.services.simulation.view import (
     SimulatedView,
     ViewGeometry,
     ViewPlan,
@@ -15,9 +15,9 @@ from services.simulation.view import (
     simulate_block,
     simulate_view,
 )
-from services.simulation.world import World, make_world
-from services.tasks import Work
-from services.types import ChipArray, ControlPoints
+from amers.services.simulation.world import World, make_world
+from amers.services.tasks import Work
+from amers.services.types import ChipArray, ControlPoints
 
 SHAPE = (700, 700)
 GSD_M = 1.0

@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 import shapely
 
-from benchmarks._continent import Continent, open_continent
-from benchmarks.continent import make
-from services.errors import InputError
-from services.formats.images.scenes import read_scene
-from services.formats.stac.catalogue import read_catalogue
-from services.imagery.catalogue import ImageCatalogue
-from services.imagery.scene import Scene
-from services.imagery.source import Window, render_chip
-from services.sensors.base import SensorModel
-from services.simulation.archive import (
+from amers.services.errors import InputError
+from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.stac.catalogue import read_catalogue
+from amers.services.imagery.catalogue import ImageCatalogue
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import Window, render_chip
+from amers.services.sensors.base import SensorModel
+from amers.services.simulation.archive import (
     CONTINENT,
     IMAGE_SIGMA_M,
     JITTER_PX,
@@ -26,8 +24,10 @@ from services.simulation.archive import (
     archive_views,
     later_views,
 )
-from services.simulation.conditions import clouds_over
-from services.types import Array
+from amers.services.simulation.conditions import clouds_over
+from amers.services.types import Array
+from benchmarks._continent import Continent, open_continent
+from benchmarks.continent import make
 
 pytestmark = [pytest.mark.long, pytest.mark.endurance]
 

@@ -9,6 +9,21 @@ import cv2
 import numpy as np
 import pytest
 
+from amers.services.formats.block.check import check_block
+from amers.services.formats.block.document import BlockMetadata, BlockSpecification, Provenance
+from amers.services.formats.block.reader import FolderChips, read_block
+from amers.services.formats.block.writer import write_block
+from amers.services.formats.elevation.dem import read_dem
+from amers.services.formats.images.scenes import read_scene
+from amers.services.geodesy import box_around, move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import render_chip
+from amers.services.matching.correlate import CorrelationOptions, find_chip
+from amers.services.quality.normal_law import normal_ce90
+from amers.services.simulation.land import WATER
+from amers.services.simulation.tiles import TiledView
+from amers.services.simulation.view import ViewPlan, plan_geometry
+from amers.services.types import Array, ControlPoints, Frame
 from benchmarks._continent import Continent
 from benchmarks._continent_control import DEM_SIGMA_M, FRAME_SIGMA_M, POINT_SIGMA_M
 from benchmarks._continent_density import counts, judge_density, textured_cells
@@ -22,21 +37,6 @@ from benchmarks._continent_points import (
     true_places,
 )
 from benchmarks._simulated import lay_points
-from services.formats.block.check import check_block
-from services.formats.block.document import BlockMetadata, BlockSpecification, Provenance
-from services.formats.block.reader import FolderChips, read_block
-from services.formats.block.writer import write_block
-from services.formats.elevation.dem import read_dem
-from services.formats.images.scenes import read_scene
-from services.geodesy import box_around, move_metres
-from services.imagery.scene import Scene
-from services.imagery.source import render_chip
-from services.matching.correlate import CorrelationOptions, find_chip
-from services.quality.normal_law import normal_ce90
-from services.simulation.land import WATER
-from services.simulation.tiles import TiledView
-from services.simulation.view import ViewPlan, plan_geometry
-from services.types import Array, ControlPoints, Frame
 
 pytestmark = [pytest.mark.long, pytest.mark.endurance]
 

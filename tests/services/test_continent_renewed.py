@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from amers.services.formats.images.scenes import read_scene
+from amers.services.geodesy import box_around, east_north_up
+from amers.services.imagery.scene import Scene
+from amers.services.production.from_images import ProductionOptions, produce_points
+from amers.services.production.new_points import points_where_short, registered_scene, short_ground
+from amers.services.registration.on_points import register_scene
+from amers.services.registration.options import RegistrationOptions
+from amers.services.types import Array, ControlPoints
 from benchmarks._continent import Continent
 from benchmarks._continent_points import common_error_m, errors_m, true_places
-from services.formats.images.scenes import read_scene
-from services.geodesy import box_around, east_north_up
-from services.imagery.scene import Scene
-from services.production.from_images import ProductionOptions, produce_points
-from services.production.new_points import points_where_short, registered_scene, short_ground
-from services.registration.on_points import register_scene
-from services.registration.options import RegistrationOptions
-from services.types import Array, ControlPoints
 from tests.services.simulated import MemoryChips
 from tests.services.ties import whitened_square
 

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from amers.services.geodesy import move_metres
+from amers.services.registration.options import RegistrationOptions
 from benchmarks._campaign import Outcome, attempt, outcome_of
 from benchmarks._distorted_tables import accused, by_kind, distorted_acceptance, figures_of
 from benchmarks._distorted_trials import DISTORTED, distorted_trial
@@ -24,8 +26,6 @@ from benchmarks._families import outcome_line, read_outcomes
 from benchmarks._scenes import Prepared, prepare
 from benchmarks._trials import draw_trial
 from benchmarks._worlds import Block, Place, block_of
-from services.geodesy import move_metres
-from services.registration.options import RegistrationOptions
 
 pytestmark = pytest.mark.long
 

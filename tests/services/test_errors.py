@@ -2,7 +2,7 @@
 
 import pytest
 
-from services.errors import causes, causes_and_contexts
+from amers.services.errors import causes, causes_and_contexts
 
 
 def linked(*names: str) -> dict[str, Exception]:

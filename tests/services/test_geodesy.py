@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import Geod, Transformer
 
-from services.geodesy import (
+from amers.services.geodesy import (
     box_around,
     continuous,
     east_north_up,
@@ -19,7 +19,7 @@ from services.geodesy import (
     move_metres,
     wrapped_degrees,
 )
-from services.types import Array
+from amers.services.types import Array
 
 a_micrometre = 1e-6
 a_micrometre_deg = a_micrometre / 111_000.0

@@ -7,9 +7,9 @@ import pytest
 from rasterio.transform import Affine
 from rasterio.warp import transform
 
-from services.errors import InputError
-from services.geodesy import east_north_up
-from services.map_grid import MapGrid, check_map_code, utm_of
+from amers.services.errors import InputError
+from amers.services.geodesy import east_north_up
+from amers.services.map_grid import MapGrid, check_map_code, utm_of
 
 a_micropixel = 1e-6
 a_millionth = 1e-6

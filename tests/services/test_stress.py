@@ -8,6 +8,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from amers.services.imagery.source import Window
+from amers.services.registration.on_points import Registration, register_scene
+from amers.services.registration.options import RegistrationOptions
+from amers.services.types import Measures
 from benchmarks._campaign import Outcome, attempt
 from benchmarks._families import DRAWS, FAMILIES, outcome_line, read_outcomes
 from benchmarks._scenes import prepare
@@ -22,10 +26,6 @@ from benchmarks._trials import (
     sensor_trial,
 )
 from benchmarks._worlds import Block, Place, block_of
-from services.imagery.source import Window
-from services.registration.on_points import Registration, register_scene
-from services.registration.options import RegistrationOptions
-from services.types import Measures
 
 pytestmark = pytest.mark.long
 

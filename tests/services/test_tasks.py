@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from services.tasks import Arrays, Work
+from amers.services.tasks import Arrays, Work
 
 
 def doubled(value: int) -> Arrays:

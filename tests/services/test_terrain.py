@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from services import terrain as terrain_module
-from services.errors import CoverageError
-from services.imagery.source import ArrayImage, FloatImage, Window
-from services.lines_of_sight import intersect_terrain
-from services.map_grid import MapGrid
-from services.sensors.ortho import OrthoModel
-from services.sensors.pushbroom import PushbroomModel
-from services.simulation.orbit import pushbroom_over
-from services.terrain import Terrain
-from services.types import Array
+from amers.services import terrain as terrain_module
+from amers.services.errors import CoverageError
+from amers.services.imagery.source import ArrayImage, FloatImage, Window
+from amers.services.lines_of_sight import intersect_terrain
+from amers.services.map_grid import MapGrid
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.simulation.orbit import pushbroom_over
+from amers.services.terrain import Terrain
+from amers.services.types import Array
 
 a_tenth_of_a_millimetre = 1e-4
 a_millimetre = 1e-3

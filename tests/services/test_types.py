@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.types import (
+from amers.services.types import (
     UNKNOWN_FRAME,
     Acquisition,
     ControlPoints,

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy import fft
 
-from services.types import Array, FloatImage
+from amers.services.types import Array, FloatImage
 
 
 def texture(rng: np.random.Generator, side: int, smoothness_px: float) -> Array:

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.geodesy import metres_per_degree
-from services.simulation.view import ViewGeometry
-from services.types import Array, BoolArray, Observations
+from amers.services.geodesy import metres_per_degree
+from amers.services.simulation.view import ViewGeometry
+from amers.services.types import Array, BoolArray, Observations
 from tests.services.simulated import world
 
 

@@ -4,13 +4,13 @@ from functools import cache
 
 import numpy as np
 
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.map_grid import MapGrid
-from services.sensors.rpc_fit import fit_rpc
-from services.simulation.orbit import pushbroom_over
-from services.terrain import Terrain
-from services.types import Acquisition, Array, FloatImage
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.map_grid import MapGrid
+from amers.services.sensors.rpc_fit import fit_rpc
+from amers.services.simulation.orbit import pushbroom_over
+from amers.services.terrain import Terrain
+from amers.services.types import Acquisition, Array, FloatImage
 
 SHAPE = (420, 380)
 GSD_M = 2.0

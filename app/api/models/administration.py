@@ -4,9 +4,9 @@ from datetime import datetime
 from typing import Literal
 from uuid import UUID
 
-from app.api.models.base import JsonObject, Link, Reply
-from app.api.models.features import AnyGeometry
-from app.auth import Scope
+from amers.app.api.models.base import JsonObject, Link, Reply
+from amers.app.api.models.features import AnyGeometry
+from amers.app.auth import Scope
 
 
 class TokenRecord(Reply):

@@ -4,8 +4,8 @@ from datetime import datetime
 from typing import Literal
 from uuid import UUID
 
-from app.api.models.base import Count, Reply, StatedAccuracy
-from app.db.schema import BlockState
+from amers.app.api.models.base import Count, Reply, StatedAccuracy
+from amers.app.db.schema import BlockState
 
 
 class BlockRecord(Reply):

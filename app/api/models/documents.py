@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from app.api.models.base import JsonObject, Link, Missing, Reply
+from amers.app.api.models.base import JsonObject, Link, Missing, Reply
 
 Box = list[float]
 

@@ -1,6 +1,6 @@
 """Models of features that are made one by one: a point with its views, scenes as STAC items.
 
-Pages of features are built in the database; `app.api.json_schemas` describes them.
+Pages of features are built in the database; `amers.app.api.json_schemas` describes them.
 """
 
 from datetime import date, datetime
@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, WithJsonSchema
 
-from app.api.models.base import Count, JsonObject, Link, Missing, Reply, StatedAccuracy
+from amers.app.api.models.base import Count, JsonObject, Link, Missing, Reply, StatedAccuracy
 
 PointGeometry = Annotated[
     JsonObject,

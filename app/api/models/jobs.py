@@ -9,8 +9,8 @@ from uuid import UUID
 
 from pydantic import ConfigDict, Field
 
-from app.api.models.base import JsonObject, Link, Missing, Reply, StatedAccuracy, missing
-from app.db.schema import JobState
+from amers.app.api.models.base import JsonObject, Link, Missing, Reply, StatedAccuracy, missing
+from amers.app.db.schema import JobState
 
 Percent = Annotated[int, Field(ge=0, le=100)]
 

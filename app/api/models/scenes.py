@@ -4,10 +4,10 @@ from datetime import datetime
 from typing import Literal
 from uuid import UUID
 
-from app.api.models.base import Reply, StatedAccuracy
-from app.api.models.features import AnyGeometry
-from app.db.scene_registrations import RegistrationOutcome
-from app.db.schema import SceneState, UploadPurpose
+from amers.app.api.models.base import Reply, StatedAccuracy
+from amers.app.api.models.features import AnyGeometry
+from amers.app.db.scene_registrations import RegistrationOutcome
+from amers.app.db.schema import SceneState, UploadPurpose
 
 
 class SceneRegistration(Reply):

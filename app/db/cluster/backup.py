@@ -11,10 +11,10 @@ import re
 import tempfile
 from pathlib import Path
 
-from app.db.cluster.programs import read_archive, run_program
-from app.db.preparation import prepare
-from app.db.revisions import driver_connection
-from app.errors import Conflict, InputError
+from amers.app.db.cluster.programs import read_archive, run_program
+from amers.app.db.preparation import prepare
+from amers.app.db.revisions import driver_connection
+from amers.app.errors import Conflict, InputError
 
 POSTGIS_ALONE = "--extension=postgis"
 """No extension of others is read, whose tables may be closed to this role."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from app.errors import InputError
+from amers.app.errors import InputError
 
 INSTALL_HINT = (
     "install PostgreSQL with PostGIS (Debian, Ubuntu: apt-get install postgresql postgresql-postgis), "

@@ -25,13 +25,13 @@ import psycopg
 from psycopg.conninfo import make_conninfo
 from psycopg.pq import PGconn, Ping
 
-from app import reserve
-from app.config import Settings
-from app.db import session
-from app.db.address import check_address, with_password
-from app.db.cluster.binaries import ServerUser, find_binaries, run_as, server_user
-from app.db.sql_files import sql_file
-from app.errors import InputError
+from amers.app import reserve
+from amers.app.config import Settings
+from amers.app.db import session
+from amers.app.db.address import check_address, with_password
+from amers.app.db.cluster.binaries import ServerUser, find_binaries, run_as, server_user
+from amers.app.db.sql_files import sql_file
+from amers.app.errors import InputError
 
 ROLE = "amers_app"
 SUPERUSER = "amers"

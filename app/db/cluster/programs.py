@@ -8,10 +8,10 @@ from pathlib import Path
 
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 
-from app.db.cluster.binaries import USUAL_FOLDERS
-from app.db.revisions import driver_connection
-from app.db.session import PATIENCE
-from app.errors import InputError
+from amers.app.db.cluster.binaries import USUAL_FOLDERS
+from amers.app.db.revisions import driver_connection
+from amers.app.db.session import PATIENCE
+from amers.app.errors import InputError
 
 ADVICE = {
     "unsupported version": "a newer pg_dump wrote the archive: install the programs of its version",

@@ -1,7 +1,7 @@
 """The declaration of a collection of features: its columns, its geometry and who sees which rows.
 
-Expressions of a declaration are over the tables of `app.db.schema`. They may contain the bind parameters
-`IS_ADMIN` and `VIEWER` (the caller) and `REFERENCE` (the text that names one feature).
+Expressions of a declaration are over the tables of `amers.app.db.schema`. They may contain the bind
+parameters `IS_ADMIN` and `VIEWER` (the caller) and `REFERENCE` (the text that names one feature).
 """
 
 from collections.abc import Callable, Sequence
@@ -29,9 +29,9 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-from app.db.engine import Connection
-from app.db.features.bbox import Box
-from app.db.features.crs import CRS84, CRS84H, FLAT, WITH_HEIGHT, Crs
+from amers.app.db.engine import Connection
+from amers.app.db.features.bbox import Box
+from amers.app.db.features.crs import CRS84, CRS84H, FLAT, WITH_HEIGHT, Crs
 
 SqlType = Literal["bigint", "real", "double precision", "text", "date", "timestamptz", "boolean"]
 

@@ -12,13 +12,13 @@ from sqlalchemy.sql.compiler import SQLCompiler
 from sqlalchemy.sql.expression import ClauseElement, Executable
 from sqlalchemy.types import NullType
 
-from app.db.constants import integer_constant, text_constant
-from app.db.engine import Connection, driver
-from app.db.features.bbox import WORLD
-from app.db.features.collection import Collection, Viewer
-from app.db.features.predicates import ANYTHING, BoxShape, height_predicate
-from app.db.features.query import KEPT_STATEMENTS, Selection, select_visible
-from app.db.statements import HotStatement, hot, hot_like
+from amers.app.db.constants import integer_constant, text_constant
+from amers.app.db.engine import Connection, driver
+from amers.app.db.features.bbox import WORLD
+from amers.app.db.features.collection import Collection, Viewer
+from amers.app.db.features.predicates import ANYTHING, BoxShape, height_predicate
+from amers.app.db.features.query import KEPT_STATEMENTS, Selection, select_visible
+from amers.app.db.statements import HotStatement, hot, hot_like
 
 EXACT_COUNT = 10_000
 COUNTING_MS = 1_000

@@ -30,14 +30,14 @@ from sqlalchemy import (
     or_,
 )
 
-from app.db.constants import integer_constant
-from app.db.features.collection import Collection, Property
-from app.db.features.cql2_bounds import MOST_NODES, parse_geometry, parse_text
-from app.db.features.crs import CRS84, Crs
-from app.db.features.instants import Moment, Time, parse_moment
-from app.db.features.predicates import Condition, geometry_from_wkb
-from app.db.schema.base import Double
-from app.errors import InvalidParameter
+from amers.app.db.constants import integer_constant
+from amers.app.db.features.collection import Collection, Property
+from amers.app.db.features.cql2_bounds import MOST_NODES, parse_geometry, parse_text
+from amers.app.db.features.crs import CRS84, Crs
+from amers.app.db.features.instants import Moment, Time, parse_moment
+from amers.app.db.features.predicates import Condition, geometry_from_wkb
+from amers.app.db.schema.base import Double
+from amers.app.errors import InvalidParameter
 
 GEOMETRY = ("geometry", "geom")
 KEPT_FILTERS = 32

@@ -8,12 +8,12 @@ from typing import Any
 
 import shapely
 
-from app.db.features.antimeridian import on_the_map
-from app.db.features.cql2_process import parse
-from app.db.features.cql2_tokens import check_text, check_times
-from app.db.features.crs import Crs, lon_lat_from_mercator
-from app.db.features.instants import parse_moment
-from app.errors import InvalidParameter
+from amers.app.db.features.antimeridian import on_the_map
+from amers.app.db.features.cql2_process import parse
+from amers.app.db.features.cql2_tokens import check_text, check_times
+from amers.app.db.features.crs import Crs, lon_lat_from_mercator
+from amers.app.db.features.instants import parse_moment
+from amers.app.errors import InvalidParameter
 
 LONGEST_JSON = 2_000_000
 """Characters of a filter in JSON."""

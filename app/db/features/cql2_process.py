@@ -15,8 +15,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from app.child_processes import python_command
-from app.errors import InvalidParameter, TooMany
+from amers.app.child_processes import python_command
+from amers.app.errors import InvalidParameter, TooMany
 
 PROCESSES = 2
 LONGEST_PARSE_S = 10.0

@@ -8,8 +8,8 @@ a text, a name or a number. The check reads each character once and does not rec
 import re
 from collections.abc import Iterator
 
-from app.db.features.instants import parse_moment
-from app.errors import InvalidParameter
+from amers.app.db.features.instants import parse_moment
+from amers.app.errors import InvalidParameter
 
 LONGEST_TEXT = 4_000
 """Characters of a filter in text."""

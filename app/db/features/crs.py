@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from sqlalchemy import ColumnElement, func
 
-from app.db.constants import integer_constant
-from services.types import Array
+from amers.app.db.constants import integer_constant
+from amers.services.types import Array
 
 EARTH_RADIUS_M = 6_378_137.0
 """Radius of the sphere of EPSG:3857."""

@@ -13,10 +13,10 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Date, DateTime, Text, cast, func, literal
 
-from app.db.constants import text_constant
-from app.db.features.collection import Property
-from app.db.schema.base import Timestamp
-from app.errors import InvalidParameter
+from amers.app.db.constants import text_constant
+from amers.app.db.features.collection import Property
+from amers.app.db.schema.base import Timestamp
+from amers.app.errors import InvalidParameter
 
 DATE = re.compile(r"\d{4}-\d{2}-\d{2}", re.ASCII)
 # Offsets and the numbers of days are checked by the calendar of Python.

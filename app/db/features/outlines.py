@@ -4,8 +4,8 @@ from typing import get_args
 
 from sqlalchemy import Numeric, Text, and_, cast, func, or_, select
 
-from app.db.constants import integer_constant, text_constant
-from app.db.features.collection import (
+from amers.app.db.constants import integer_constant, text_constant
+from amers.app.db.features.collection import (
     IS_ADMIN,
     REFERENCE,
     VIEWER,
@@ -13,8 +13,8 @@ from app.db.features.collection import (
     Property,
     column_property,
 )
-from app.db.schema import BlockState, SceneState, block, registration, scene
-from app.db.schema.base import Real
+from amers.app.db.schema import BlockState, SceneState, block, registration, scene
+from amers.app.db.schema.base import Real
 
 _BLOCK_VISIBLE = or_(block.c.state == text_constant("published"), IS_ADMIN)
 

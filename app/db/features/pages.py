@@ -17,11 +17,11 @@ import psycopg
 from psycopg.types.string import ByteaBinaryLoader
 from sqlalchemy import ColumnElement, Text, cast, func, select
 
-from app.db.constants import integer_constant, text_constant
-from app.db.engine import Connection, driver
-from app.db.features.collection import REFERENCE
-from app.db.features.crs import from_storage
-from app.db.features.query import (
+from amers.app.db.constants import integer_constant, text_constant
+from amers.app.db.engine import Connection, driver
+from amers.app.db.features.collection import REFERENCE
+from amers.app.db.features.crs import from_storage
+from amers.app.db.features.query import (
     KEPT_STATEMENTS,
     Columns,
     Key,
@@ -32,9 +32,9 @@ from app.db.features.query import (
     page_select,
     sortable,
 )
-from app.db.features.serialization import csv_text, feature_text, plain_value
-from app.db.schema import installation
-from app.db.statements import CopyOut, HotStatement, hot
+from amers.app.db.features.serialization import csv_text, feature_text, plain_value
+from amers.app.db.schema import installation
+from amers.app.db.statements import CopyOut, HotStatement, hot
 
 ROWS_AT_ONCE = 2_000
 
@@ -103,7 +103,7 @@ def stream_geojson(
 
 
 def copy_csv(connection: Connection, selection: Selection, after: Key | None, limit: int) -> BytesIO:
-    """A page and one row more, as CSV that `services.formats.vector.feature_files` makes into columns.
+    """A page and one row more, as CSV for `amers.services.formats.vector.feature_files`.
 
     Columns are the values that order features (a JSON text); longitude or east, latitude or north, and
     height of points, else the geometry as hexadecimal WKB; the key and the properties.

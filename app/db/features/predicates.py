@@ -19,10 +19,10 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import NullType
 
-from app.db.constants import integer_constant
-from app.db.features.bbox import Box
-from app.db.features.collection import Collection, Property
-from app.db.features.instants import Moment, Time
+from amers.app.db.constants import integer_constant
+from amers.app.db.features.bbox import Box
+from amers.app.db.features.collection import Collection, Property
+from amers.app.db.features.instants import Moment, Time
 
 
 @dataclass(frozen=True)

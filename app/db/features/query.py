@@ -23,13 +23,13 @@ from sqlalchemy import (
     true,
 )
 
-from app.db.constants import integer_constant
-from app.db.features.collection import Collection, Property, Viewer
-from app.db.features.crs import Crs
-from app.db.features.predicates import ANYTHING, BoxShape, Condition, box_parameters, box_predicate
-from app.db.opaque import opaque
-from app.db.schema.base import Double
-from app.db.statements import HotStatement, hot_like
+from amers.app.db.constants import integer_constant
+from amers.app.db.features.collection import Collection, Property, Viewer
+from amers.app.db.features.crs import Crs
+from amers.app.db.features.predicates import ANYTHING, BoxShape, Condition, box_parameters, box_predicate
+from amers.app.db.opaque import opaque
+from amers.app.db.schema.base import Double
+from amers.app.db.statements import HotStatement, hot_like
 
 KEPT_STATEMENTS = 512
 """Statements kept for each step: of the layouts and orders that users ask for."""

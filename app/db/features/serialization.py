@@ -5,11 +5,11 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Text, case, cast, func
 
-from app.db.constants import integer_constant, text_constant
-from app.db.features.collection import Property
-from app.db.features.crs import from_storage, in_own_order
-from app.db.features.instants import time_text
-from app.db.features.query import Layout, Selection
+from amers.app.db.constants import integer_constant, text_constant
+from amers.app.db.features.collection import Property
+from amers.app.db.features.crs import from_storage, in_own_order
+from amers.app.db.features.instants import time_text
+from amers.app.db.features.query import Layout, Selection
 
 DEGREE_DIGITS = 9
 """Decimals of a degree in replies: a tenth of a millimetre."""

@@ -11,12 +11,12 @@ from uuid import UUID
 from sqlalchemy import ColumnElement, Double, case, cast, func, select, update
 from sqlalchemy.dialects.postgresql import insert
 
-from app.db.engine import Connection
-from app.db.jobs.jobs import COLUMNS, Job
-from app.db.jobs.queue import issue_ticket, lock_claims, replace_spent_ticket
-from app.db.rows import among, every, only
-from app.db.schema import clock, job, job_turn
-from app.db.statements import named
+from amers.app.db.engine import Connection
+from amers.app.db.jobs.jobs import COLUMNS, Job
+from amers.app.db.jobs.queue import issue_ticket, lock_claims, replace_spent_ticket
+from amers.app.db.rows import among, every, only
+from amers.app.db.schema import clock, job, job_turn
+from amers.app.db.statements import named
 
 NEXT_JOB = named("jobs.sql", "next_job")
 DAY_S = 86_400.0

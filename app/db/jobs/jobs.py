@@ -8,10 +8,10 @@ from uuid import UUID, uuid4
 from sqlalchemy import ColumnElement, delete, extract, func, select, tuple_, update
 from sqlalchemy.dialects.postgresql import insert
 
-from app.db.engine import Connection
-from app.db.jobs.queue import issue_ticket, replace_spent_ticket
-from app.db.rows import among, columns_of, every, first
-from app.db.schema import JobResponse, JobState, clock, job, registration, uptime_s
+from amers.app.db.engine import Connection
+from amers.app.db.jobs.queue import issue_ticket, replace_spent_ticket
+from amers.app.db.rows import among, columns_of, every, first
+from amers.app.db.schema import JobResponse, JobState, clock, job, registration, uptime_s
 
 OPEN: tuple[JobState, ...] = ("accepted", "running")
 """States of jobs that have not ended."""

@@ -6,10 +6,10 @@ from uuid import UUID
 
 from sqlalchemy import select
 
-from app.db.engine import Connection
-from app.db.rows import columns_of, every, first, only
-from app.db.schema import job_message
-from app.db.statements import named
+from amers.app.db.engine import Connection
+from amers.app.db.rows import columns_of, every, first, only
+from amers.app.db.schema import job_message
+from amers.app.db.statements import named
 
 PAST_JOBS = 20
 """The expected duration of a process is the median of so many last successes."""

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy import func, select
 
-from app.db.engine import Connection, driver
-from app.db.statements import named
+from amers.app.db.engine import Connection, driver
+from amers.app.db.statements import named
 
 if TYPE_CHECKING:
     import procrastinate

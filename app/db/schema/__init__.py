@@ -2,17 +2,17 @@
 
 Statements name columns through these tables, and the column list of a row comes from its table
 (`app/db/rows.py`). Functions, triggers and the first rows are SQL: `app/db/sql/functions.sql`,
-`triggers.sql` and `first_rows.sql`. `python -m app.db.ddl` prints the whole store as one script.
+`triggers.sql` and `first_rows.sql`. `python -m amers.app.db.ddl` prints the whole store as one script.
 
 The tables of the queue belong to procrastinate and are not described here.
 """
 
-from app.db.schema.access import audit, ended_session, installation, token, uptime
-from app.db.schema.base import clock, hours, metadata, now, uptime_s
-from app.db.schema.integrity import damaged_file, result_file
-from app.db.schema.jobs import job, job_message, job_turn, scene, upload
-from app.db.schema.points import block, chip_file, density_cell, image, point, view
-from app.db.schema.registrations import (
+from amers.app.db.schema.access import audit, ended_session, installation, token, uptime
+from amers.app.db.schema.base import clock, hours, metadata, now, uptime_s
+from amers.app.db.schema.integrity import damaged_file, result_file
+from amers.app.db.schema.jobs import job, job_message, job_turn, scene, upload
+from amers.app.db.schema.points import block, chip_file, density_cell, image, point, view
+from amers.app.db.schema.registrations import (
     measure,
     point_history,
     reference_image,
@@ -21,7 +21,7 @@ from app.db.schema.registrations import (
     view_history,
     view_measure,
 )
-from app.db.states import BlockState, JobResponse, JobState, SceneState, UploadPurpose
+from amers.app.db.states import BlockState, JobResponse, JobState, SceneState, UploadPurpose
 
 __all__ = [
     "BlockState",

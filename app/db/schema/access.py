@@ -18,7 +18,7 @@ from sqlalchemy import (
     text,
 )
 
-from app.db.schema.base import Double, Json, Timestamp, clock, metadata, now, one_of, uptime_s
+from amers.app.db.schema.base import Double, Json, Timestamp, clock, metadata, now, one_of, uptime_s
 
 token = Table(
     "token",

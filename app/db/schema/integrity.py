@@ -2,7 +2,7 @@
 
 from sqlalchemy import BigInteger, CheckConstraint, Column, ForeignKey, Index, Table, Text
 
-from app.db.schema.base import Timestamp, clock, metadata
+from amers.app.db.schema.base import Timestamp, clock, metadata
 
 # Files of the results of jobs; other files have size and checksum in the rows that name them.
 result_file = Table(

@@ -17,7 +17,7 @@ from sqlalchemy import (
     text,
 )
 
-from app.db.schema.base import (
+from amers.app.db.schema.base import (
     Double,
     Json,
     MapOutline,
@@ -31,7 +31,7 @@ from app.db.schema.base import (
     one_of,
     uptime_s,
 )
-from app.db.states import JobResponse, JobState, SceneState, UploadPurpose
+from amers.app.db.states import JobResponse, JobState, SceneState, UploadPurpose
 
 scene = Table(
     "scene",

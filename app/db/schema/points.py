@@ -21,7 +21,7 @@ from sqlalchemy import (
     text,
 )
 
-from app.db.schema.base import (
+from amers.app.db.schema.base import (
     Double,
     Json,
     MapOutline,
@@ -34,7 +34,7 @@ from app.db.schema.base import (
     on_map,
     one_of,
 )
-from app.db.states import BlockState
+from amers.app.db.states import BlockState
 
 block = Table(
     "block",

@@ -17,7 +17,7 @@ from sqlalchemy import (
     text,
 )
 
-from app.db.schema.base import Double, Json, PointZ, Polygon, Real, Timestamp, metadata, now
+from amers.app.db.schema.base import Double, Json, PointZ, Polygon, Real, Timestamp, metadata, now
 
 registration = Table(
     "registration",

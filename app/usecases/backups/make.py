@@ -8,14 +8,14 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
-from app.db import installation, revisions, stored_files
-from app.db.cluster import backup as archive
-from app.db.engine import Database, driver, export_snapshot
-from app.db.stored_files import NamedFile
-from app.errors import Conflict, DamagedFile, InputError, NotFound
-from app.storage import Storage, trash
-from app.usecases import damage, storage_identity
-from app.usecases.backups.manifest import (
+from amers.app.db import installation, revisions, stored_files
+from amers.app.db.cluster import backup as archive
+from amers.app.db.engine import Database, driver, export_snapshot
+from amers.app.db.stored_files import NamedFile
+from amers.app.errors import Conflict, DamagedFile, InputError, NotFound
+from amers.app.storage import Storage, trash
+from amers.app.usecases import damage, storage_identity
+from amers.app.usecases.backups.manifest import (
     ARCHIVE,
     READ_BYTES,
     STORAGE,
@@ -25,8 +25,8 @@ from app.usecases.backups.manifest import (
     sha256_of,
     write_manifest,
 )
-from app.usecases.installation import Installation
-from services.types import Progress, no_progress
+from amers.app.usecases.installation import Installation
+from amers.services.types import Progress, no_progress
 
 
 def make_backup(here: Installation, folder: Path, progress: Progress = no_progress) -> Manifest:

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 from uuid import UUID
 
-from app.errors import InputError
-from services.types import Progress, no_progress
+from amers.app.errors import InputError
+from amers.services.types import Progress, no_progress
 
 MANIFEST = "manifest.json"
 ARCHIVE = "database.dump"

@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-from app.db import engine, installation, revisions
-from app.db.cluster import backup as archive
-from app.errors import Conflict, InputError
-from app.storage import MARKER, Marker, Storage, write_marker
-from app.storage.trash import TRASH
-from app.usecases import damage
-from app.usecases.backups.manifest import (
+from amers.app.db import engine, installation, revisions
+from amers.app.db.cluster import backup as archive
+from amers.app.errors import Conflict, InputError
+from amers.app.storage import MARKER, Marker, Storage, write_marker
+from amers.app.storage.trash import TRASH
+from amers.app.usecases import damage
+from amers.app.usecases.backups.manifest import (
     ARCHIVE,
     MANIFEST,
     STORAGE,
@@ -18,8 +18,8 @@ from app.usecases.backups.manifest import (
     read_manifest,
     sha256_of,
 )
-from app.usecases.garbage_collection import FOLDER_STATES
-from services.types import Progress, no_progress, part_of
+from amers.app.usecases.garbage_collection import FOLDER_STATES
+from amers.services.types import Progress, no_progress, part_of
 
 RESTORING = "restoring.txt"
 """Key of the file in a storage into which a backup is being restored: the SHA-256 of its manifest."""

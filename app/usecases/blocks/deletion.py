@@ -4,14 +4,14 @@ from dataclasses import dataclass
 
 import psycopg
 
-from app.db import block_deletion, blocks
-from app.db.blocks import Block
-from app.db.engine import Connection, limit_lock_wait
-from app.errors import Conflict
-from app.usecases import storage_identity
-from app.usecases.blocks.publication import lock_block
-from app.usecases.garbage_collection import Bin, moment
-from app.usecases.installation import Installation
+from amers.app.db import block_deletion, blocks
+from amers.app.db.blocks import Block
+from amers.app.db.engine import Connection, limit_lock_wait
+from amers.app.errors import Conflict
+from amers.app.usecases import storage_identity
+from amers.app.usecases.blocks.publication import lock_block
+from amers.app.usecases.garbage_collection import Bin, moment
+from amers.app.usecases.installation import Installation
 
 LONGEST_WAIT_S = 5
 """Longest wait for the end of ingestions: one of them may use the files of the block."""

@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from app.auth import Scope
-from app.db import blocks, points
-from app.db.engine import Connection
-from app.db.points import StoredPoints
-from app.db.tokens import Token
-from app.errors import InputError, NotFound
-from app.usecases.damage import open_chips
-from app.usecases.processes import Commit, Process, Work
-from app.usecases.results import store_results
-from services.formats.block.document import (
+from amers.app.auth import Scope
+from amers.app.db import blocks, points
+from amers.app.db.engine import Connection
+from amers.app.db.points import StoredPoints
+from amers.app.db.tokens import Token
+from amers.app.errors import InputError, NotFound
+from amers.app.usecases.damage import open_chips
+from amers.app.usecases.processes import Commit, Process, Work
+from amers.app.usecases.results import store_results
+from amers.services.formats.block.document import (
     NAME_PATTERN,
     AccuracyFigure,
     BlockMetadata,
@@ -27,10 +27,10 @@ from services.formats.block.document import (
     Provenance,
     rectangle,
 )
-from services.formats.block.document_json import parse_block_json
-from services.formats.block.writer import write_block
-from services.quality.frames import shared_frame
-from services.types import (
+from amers.services.formats.block.document_json import parse_block_json
+from amers.services.formats.block.writer import write_block
+from amers.services.quality.frames import shared_frame
+from amers.services.types import (
     Array,
     ChipArray,
     ChipSource,

@@ -9,27 +9,32 @@ from pathlib import Path
 
 import numpy as np
 
-from app.errors import InputError
-from app.usecases.control_files import ControlFiles, read_control
-from app.usecases.production import refuse_existing
-from services.adjustment.frame_fit import FrameFit, fit_frame, misfits_m
-from services.formats.block.document import AccuracyFigure, BlockDocument, BlockMetadata, Provenance
-from services.formats.block.reader import BlockContents, FolderChips, block_member, read_block
-from services.formats.block.writer import write_block
-from services.formats.images.scenes import read_scene
-from services.formats.sensor_models.rpc_text import parse_rpc_text
-from services.formats.text_files import read_text
-from services.geodesy import move_metres
-from services.imagery.scene import Scene
-from services.production.placed_block import (
+from amers.app.errors import InputError
+from amers.app.usecases.control_files import ControlFiles, read_control
+from amers.app.usecases.production import refuse_existing
+from amers.services.adjustment.frame_fit import FrameFit, fit_frame, misfits_m
+from amers.services.formats.block.document import (
+    AccuracyFigure,
+    BlockDocument,
+    BlockMetadata,
+    Provenance,
+)
+from amers.services.formats.block.reader import BlockContents, FolderChips, block_member, read_block
+from amers.services.formats.block.writer import write_block
+from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
+from amers.services.formats.text_files import read_text
+from amers.services.geodesy import move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.production.placed_block import (
     FoundControl,
     find_in_block,
     moved_model,
     moved_points,
 )
-from services.quality.accuracy import Accuracy, NormalisedError, accuracy, normalised_error
-from services.sensors.rpc import RpcModel
-from services.types import Array, ChipArray, ControlPoints, Frame, Progress, no_progress, part_of
+from amers.services.quality.accuracy import Accuracy, NormalisedError, accuracy, normalised_error
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Array, ChipArray, ControlPoints, Frame, Progress, no_progress, part_of
 
 
 @dataclass(frozen=True)

@@ -6,20 +6,20 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from uuid import UUID
 
-from app.auth import Scope
-from app.db import uploads
-from app.db.engine import Connection
-from app.db.tokens import Token
-from app.errors import InputError, NotFound
-from app.usecases.blocks import lifecycle
-from app.usecases.blocks.uploads import find_uploaded_block
-from app.usecases.damage import named_by_row, suspecting_damage
-from app.usecases.processes import Commit, Process, Work
-from services.errors import FormatError
-from services.formats.archives import ArchiveLimits, Member, check_archive, unpack_archive
-from services.formats.block.document_json import BLOCK_JSON
-from services.quality.accuracy_statement import accuracy_document
-from services.quality.block import quality_document
+from amers.app.auth import Scope
+from amers.app.db import uploads
+from amers.app.db.engine import Connection
+from amers.app.db.tokens import Token
+from amers.app.errors import InputError, NotFound
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.blocks.uploads import find_uploaded_block
+from amers.app.usecases.damage import named_by_row, suspecting_damage
+from amers.app.usecases.processes import Commit, Process, Work
+from amers.services.errors import FormatError
+from amers.services.formats.archives import ArchiveLimits, Member, check_archive, unpack_archive
+from amers.services.formats.block.document_json import BLOCK_JSON
+from amers.services.quality.accuracy_statement import accuracy_document
+from amers.services.quality.block import quality_document
 
 UNPACKED_TIMES = 4
 """An archive may unpack to this many times the size limit of uploads."""

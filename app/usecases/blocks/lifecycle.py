@@ -7,30 +7,30 @@ from pathlib import Path
 
 import numpy as np
 
-from app.db import block_documents, blocks
-from app.db.blocks import Block
-from app.db.engine import Connection
-from app.db.ingestion import StoredChipFile, load_contents
-from app.errors import Conflict, InputError
-from app.storage import Storage, StoredFile
-from app.usecases.blocks.lookup import find_block as find_block
-from app.usecases.blocks.publication import Published as Published
-from app.usecases.blocks.publication import check_priority
-from app.usecases.blocks.publication import find_published as find_published
-from app.usecases.blocks.publication import prioritise_block as prioritise_block
-from app.usecases.blocks.publication import publish_block as publish_block
-from app.usecases.blocks.publication import restore_block as restore_block
-from app.usecases.blocks.publication import withdraw_block as withdraw_block
-from services.errors import FormatError
-from services.formats.block.check import check_block, check_checksums
-from services.formats.block.document import AccuracyFigure
-from services.formats.block.document_json import BLOCK_JSON, parse_block_json
-from services.formats.block.reader import BlockContents, block_member
-from services.formats.chips.checksums import ChipHasher
-from services.formats.chips.npy_files import read_chip_file
-from services.quality.accuracy_statement import AccuracyStatement
-from services.quality.block import BlockQuality, block_accuracy, block_quality
-from services.types import Progress, no_progress, part_of
+from amers.app.db import block_documents, blocks
+from amers.app.db.blocks import Block
+from amers.app.db.engine import Connection
+from amers.app.db.ingestion import StoredChipFile, load_contents
+from amers.app.errors import Conflict, InputError
+from amers.app.storage import Storage, StoredFile
+from amers.app.usecases.blocks.lookup import find_block as find_block
+from amers.app.usecases.blocks.publication import Published as Published
+from amers.app.usecases.blocks.publication import check_priority
+from amers.app.usecases.blocks.publication import find_published as find_published
+from amers.app.usecases.blocks.publication import prioritise_block as prioritise_block
+from amers.app.usecases.blocks.publication import publish_block as publish_block
+from amers.app.usecases.blocks.publication import restore_block as restore_block
+from amers.app.usecases.blocks.publication import withdraw_block as withdraw_block
+from amers.services.errors import FormatError
+from amers.services.formats.block.check import check_block, check_checksums
+from amers.services.formats.block.document import AccuracyFigure
+from amers.services.formats.block.document_json import BLOCK_JSON, parse_block_json
+from amers.services.formats.block.reader import BlockContents, block_member
+from amers.services.formats.chips.checksums import ChipHasher
+from amers.services.formats.chips.npy_files import read_chip_file
+from amers.services.quality.accuracy_statement import AccuracyStatement
+from amers.services.quality.block import BlockQuality, block_accuracy, block_quality
+from amers.services.types import Progress, no_progress, part_of
 
 PARALLEL_COPIES = 4
 

@@ -1,9 +1,9 @@
 """List the blocks of the store with their accuracy, of the driver's rows alone."""
 
-from app.db import block_list
-from app.db.block_list import BlockSummary
-from app.db.session import DriverConnection
-from services.quality.accuracy_statement import AccuracyStatement, median_accuracy
+from amers.app.db import block_list
+from amers.app.db.block_list import BlockSummary
+from amers.app.db.session import DriverConnection
+from amers.services.quality.accuracy_statement import AccuracyStatement, median_accuracy
 
 
 def list_blocks(connection: DriverConnection) -> list[tuple[BlockSummary, AccuracyStatement]]:

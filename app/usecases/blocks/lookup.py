@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from app.db import blocks
-from app.db.blocks import Block
-from app.db.engine import Connection
-from app.errors import Conflict, NotFound
+from amers.app.db import blocks
+from amers.app.db.blocks import Block
+from amers.app.db.engine import Connection
+from amers.app.errors import Conflict, NotFound
 
 _PARTS_OF_DEGREE, _HALF_TURN = 1e6, 180.0
 

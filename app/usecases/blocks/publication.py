@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 
-from app.db import blocks, superseding
-from app.db.blocks import Block
-from app.db.engine import Connection
-from app.db.schema import BlockState
-from app.errors import Conflict, InputError, NotFound
-from app.usecases.blocks.lookup import find_block
+from amers.app.db import blocks, superseding
+from amers.app.db.blocks import Block
+from amers.app.db.engine import Connection
+from amers.app.db.schema import BlockState
+from amers.app.errors import Conflict, InputError, NotFound
+from amers.app.usecases.blocks.lookup import find_block
 
 MAY_BECOME: dict[BlockState, tuple[BlockState, ...]] = {
     "staged": ("published",),
@@ -34,7 +34,7 @@ def publish_block(connection: Connection, reference: str) -> Published:
     """Publish a block and, in the same step, withdraw the version of it that was published before.
 
     Where several blocks have a point at one place, the point of the better block is served: see
-    `app.db.superseding`.
+    `amers.app.db.superseding`.
 
     Raises:
         NotFound: there is no such block.

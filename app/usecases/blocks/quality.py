@@ -8,34 +8,34 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
-from app.errors import InputError
-from app.usecases.registration.reference_source import ReferenceFiles, read_reference
-from app.usecases.registration.result_folder import replacing
-from app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
-from services.formats.block.check import check_block
-from services.formats.block.document import BlockMetadata
-from services.formats.block.reader import FolderChips, block_member
-from services.formats.ground_masks import any_of, read_ground_mask, read_land_cover
-from services.formats.images.scenes import read_scene
-from services.imagery.scene import Scene
-from services.quality.block_cells import block_cells
-from services.quality.block_heights import HeightErrors, HeightModel, HeightQuality
-from services.quality.block_heights import height_errors as compare_heights
-from services.quality.block_heights import height_quality as summarise_heights
-from services.quality.block_requirements import BlockRequirements
-from services.quality.planimetry import PlanimetricQuality, planimetric_quality
-from services.quality.site_errors import Site, SiteErrors, expected_reach_m, point_errors
-from services.quality.site_images import image_errors, least_inclined
-from services.reports.block_quality import (
+from amers.app.errors import InputError
+from amers.app.usecases.registration.reference_source import ReferenceFiles, read_reference
+from amers.app.usecases.registration.result_folder import replacing
+from amers.app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
+from amers.services.formats.block.check import check_block
+from amers.services.formats.block.document import BlockMetadata
+from amers.services.formats.block.reader import FolderChips, block_member
+from amers.services.formats.ground_masks import any_of, read_ground_mask, read_land_cover
+from amers.services.formats.images.scenes import read_scene
+from amers.services.imagery.scene import Scene
+from amers.services.quality.block_cells import block_cells
+from amers.services.quality.block_heights import HeightErrors, HeightModel, HeightQuality
+from amers.services.quality.block_heights import height_errors as compare_heights
+from amers.services.quality.block_heights import height_quality as summarise_heights
+from amers.services.quality.block_requirements import BlockRequirements
+from amers.services.quality.planimetry import PlanimetricQuality, planimetric_quality
+from amers.services.quality.site_errors import Site, SiteErrors, expected_reach_m, point_errors
+from amers.services.quality.site_images import image_errors, least_inclined
+from amers.services.reports.block_quality import (
     BlockIdentification,
     BlockQualityReport,
     Measured,
     MeasuredErrors,
     block_quality_report,
 )
-from services.reports.block_quality_pages import format_block_quality_html
-from services.reports.document import format_report
-from services.types import ChipSource, ControlPoints, Progress, no_progress, part_of
+from amers.services.reports.block_quality_pages import format_block_quality_html
+from amers.services.reports.document import format_report
+from amers.services.types import ChipSource, ControlPoints, Progress, no_progress, part_of
 
 LEAST_INCLINED = 10
 """Images that are compared with the ortho-image of a site."""

@@ -5,12 +5,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, get_args
 
-from app.auth import Scope
-from app.db.engine import Connection
-from app.db.tokens import Token
-from app.errors import InputError
-from app.usecases.blocks import lifecycle
-from app.usecases.blocks.quality import (
+from amers.app.auth import Scope
+from amers.app.db.engine import Connection
+from amers.app.db.tokens import Token
+from amers.app.errors import InputError
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.blocks.quality import (
     DOCUMENT,
     PAGE,
     HeightFiles,
@@ -19,14 +19,14 @@ from app.usecases.blocks.quality import (
     SiteFile,
     write_quality_files,
 )
-from app.usecases.blocks.stored_quality import assess_stored
-from app.usecases.processes import Commit, Process, Work
-from app.usecases.results import store_results
-from app.usecases.scene_inputs import naming
-from app.usecases.server_files import file_below
-from app.usecases.terrain_file import TerrainFile
-from services.formats.elevation.geoid import vertical_crs
-from services.quality.block_requirements import BlockVerdict
+from amers.app.usecases.blocks.stored_quality import assess_stored
+from amers.app.usecases.processes import Commit, Process, Work
+from amers.app.usecases.results import store_results
+from amers.app.usecases.scene_inputs import naming
+from amers.app.usecases.server_files import file_below
+from amers.app.usecases.terrain_file import TerrainFile
+from amers.services.formats.elevation.geoid import vertical_crs
+from amers.services.quality.block_requirements import BlockVerdict
 
 
 @dataclass(frozen=True)

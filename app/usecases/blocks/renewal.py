@@ -15,34 +15,34 @@ from typing import Any
 
 import numpy as np
 
-from app.db import blocks, renewal
-from app.db.blocks import Block
-from app.db.engine import Connection, Database
-from app.db.points import points_of_block
-from app.errors import ComputationError, Conflict, InputError
-from app.storage import Storage
-from app.usecases.blocks import lifecycle
-from app.usecases.blocks.lifecycle import Ingested
-from app.usecases.blocks.renewing_scenes import GoodScene, SceneOnBlock, register_on_block
-from app.usecases.damage import open_chips
-from services.formats.block.document import BlockMetadata, Provenance
-from services.formats.block.document_json import parse_block_json
-from services.formats.block.writer import write_block
-from services.production.new_points import (
+from amers.app.db import blocks, renewal
+from amers.app.db.blocks import Block
+from amers.app.db.engine import Connection, Database
+from amers.app.db.points import points_of_block
+from amers.app.errors import ComputationError, Conflict, InputError
+from amers.app.storage import Storage
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.blocks.lifecycle import Ingested
+from amers.app.usecases.blocks.renewing_scenes import GoodScene, SceneOnBlock, register_on_block
+from amers.app.usecases.damage import open_chips
+from amers.services.formats.block.document import BlockMetadata, Provenance
+from amers.services.formats.block.document_json import parse_block_json
+from amers.services.formats.block.writer import write_block
+from amers.services.production.new_points import (
     NewPoints,
     overlapping_scenes,
     points_where_short,
     short_ground,
     shown_twice,
 )
-from services.production.renewed_views import (
+from amers.services.production.renewed_views import (
     RenewedViews,
     SeeingScene,
     with_new_points,
     with_new_views,
 )
-from services.quality.vanished import Searches, VanishedPoints, vanished_points
-from services.types import ChipSource, ControlPoints, IntArray, Progress, no_progress, part_of
+from amers.services.quality.vanished import Searches, VanishedPoints, vanished_points
+from amers.services.types import ChipSource, ControlPoints, IntArray, Progress, no_progress, part_of
 
 RENEWAL = "renewal"
 """Member of the options in the provenance of a renewed block."""

@@ -7,18 +7,18 @@ from pathlib import Path
 from typing import Any
 from uuid import UUID
 
-from app.auth import Scope
-from app.db.blocks import Block
-from app.db.engine import Connection
-from app.db.registrations import RegistrationRow
-from app.db.tokens import Token
-from app.errors import InputError
-from app.usecases.blocks import lifecycle
-from app.usecases.blocks.renewal import next_version, read_base, renew_block, stage_renewal
-from app.usecases.blocks.renewing_scenes import registered_job, scene_of_job
-from app.usecases.processes import Commit, Process, Work
-from app.usecases.results import store_results
-from services.types import part_of
+from amers.app.auth import Scope
+from amers.app.db.blocks import Block
+from amers.app.db.engine import Connection
+from amers.app.db.registrations import RegistrationRow
+from amers.app.db.tokens import Token
+from amers.app.errors import InputError
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.blocks.renewal import next_version, read_base, renew_block, stage_renewal
+from amers.app.usecases.blocks.renewing_scenes import registered_job, scene_of_job
+from amers.app.usecases.processes import Commit, Process, Work
+from amers.app.usecases.results import store_results
+from amers.services.types import part_of
 
 DOCUMENT = "renewal.json"
 

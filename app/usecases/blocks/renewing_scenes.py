@@ -9,30 +9,30 @@ from uuid import UUID
 
 import numpy as np
 
-from app.config import Settings
-from app.db import registrations
-from app.db.blocks import Block
-from app.db.engine import Connection, Database
-from app.db.history import NOT_ATTRIBUTABLE
-from app.db.jobs import jobs
-from app.db.registrations import RegistrationRow
-from app.errors import ComputationError, InputError, NotFound
-from app.storage import Storage
-from app.usecases.damage import suspecting_damage
-from app.usecases.registration.job import REGISTER_SCENE, scene_files
-from app.usecases.registration.joint_job import REGISTER_SCENES
-from app.usecases.registration.register import SceneFiles, image_key
-from app.usecases.scene_inputs import naming, present_scene
-from app.usecases.scenes import local_image, stored_keys
-from services.formats.images.bands import parse_bands
-from services.formats.images.scenes import read_scene
-from services.imagery.scene import Scene
-from services.imagery.source import CachedImage
-from services.production.new_points import registered_scene
-from services.quality.qualification import QualificationOptions
-from services.registration.on_points import register_scene
-from services.registration.options import RegistrationOptions
-from services.types import BoolArray, ChipSource, ControlPoints, IntArray, Progress, part_of
+from amers.app.config import Settings
+from amers.app.db import registrations
+from amers.app.db.blocks import Block
+from amers.app.db.engine import Connection, Database
+from amers.app.db.history import NOT_ATTRIBUTABLE
+from amers.app.db.jobs import jobs
+from amers.app.db.registrations import RegistrationRow
+from amers.app.errors import ComputationError, InputError, NotFound
+from amers.app.storage import Storage
+from amers.app.usecases.damage import suspecting_damage
+from amers.app.usecases.registration.job import REGISTER_SCENE, scene_files
+from amers.app.usecases.registration.joint_job import REGISTER_SCENES
+from amers.app.usecases.registration.register import SceneFiles, image_key
+from amers.app.usecases.scene_inputs import naming, present_scene
+from amers.app.usecases.scenes import local_image, stored_keys
+from amers.services.formats.images.bands import parse_bands
+from amers.services.formats.images.scenes import read_scene
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import CachedImage
+from amers.services.production.new_points import registered_scene
+from amers.services.quality.qualification import QualificationOptions
+from amers.services.registration.on_points import register_scene
+from amers.services.registration.options import RegistrationOptions
+from amers.services.types import BoolArray, ChipSource, ControlPoints, IntArray, Progress, part_of
 
 PROCESSES = {process.id: process for process in (REGISTER_SCENE, REGISTER_SCENES)}
 """Processes that register scenes."""

@@ -2,22 +2,22 @@
 
 from dataclasses import replace
 
-from app.db import blocks
-from app.db.engine import Database
-from app.db.points import points_of_block
-from app.errors import InputError
-from app.storage import Storage
-from app.usecases.blocks import lifecycle
-from app.usecases.blocks.quality import (
+from amers.app.db import blocks
+from amers.app.db.engine import Database
+from amers.app.db.points import points_of_block
+from amers.app.errors import InputError
+from amers.app.storage import Storage
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.blocks.quality import (
     BlockToAssess,
     QualityReferences,
     RequiredQuality,
     assess_block,
 )
-from app.usecases.damage import open_chips
-from services.formats.block.document_json import parse_block_json
-from services.reports.block_quality import BlockQualityReport
-from services.types import Progress, no_progress
+from amers.app.usecases.damage import open_chips
+from amers.services.formats.block.document_json import parse_block_json
+from amers.services.reports.block_quality import BlockQualityReport
+from amers.services.types import Progress, no_progress
 
 
 def assess_stored(

@@ -3,16 +3,16 @@
 from contextlib import suppress
 from uuid import UUID
 
-from app.auth import may_access
-from app.db import uploads
-from app.db.engine import Connection
-from app.db.tokens import Token
-from app.db.uploads import AnnouncedFile, UploadRow
-from app.errors import Conflict, InputError, NotFound, StorageOutage
-from app.usecases import quotas
-from app.usecases.garbage_collection import Bin
-from app.usecases.installation import Installation
-from app.usecases.scenes import SentFile, clean_name
+from amers.app.auth import may_access
+from amers.app.db import uploads
+from amers.app.db.engine import Connection
+from amers.app.db.tokens import Token
+from amers.app.db.uploads import AnnouncedFile, UploadRow
+from amers.app.errors import Conflict, InputError, NotFound, StorageOutage
+from amers.app.usecases import quotas
+from amers.app.usecases.garbage_collection import Bin
+from amers.app.usecases.installation import Installation
+from amers.app.usecases.scenes import SentFile, clean_name
 
 
 def receive_block(installation: Installation, caller: Token, sent: SentFile) -> UUID:

@@ -7,21 +7,21 @@ from datetime import datetime
 
 import psycopg
 
-from app.db.density import DENSITY
-from app.db.engine import Connection
-from app.db.features import counts, pages, serialization
-from app.db.features.collection import Collection, Viewer
-from app.db.features.counts import Count
-from app.db.features.crs import Crs
-from app.db.features.outlines import BLOCKS, SCENES
-from app.db.features.pages import Reading
-from app.db.features.query import Key, Selection
-from app.db.history import HISTORY
-from app.db.points import POINTS
-from app.errors import InvalidParameter, NotFound
-from app.usecases.features.page_tokens import format_token
-from app.usecases.features.query import FeatureFilter, ResolvedQuery, condition_of, crs_of
-from services.formats.vector.feature_files import Column, FeatureTable, read_feature_csv
+from amers.app.db.density import DENSITY
+from amers.app.db.engine import Connection
+from amers.app.db.features import counts, pages, serialization
+from amers.app.db.features.collection import Collection, Viewer
+from amers.app.db.features.counts import Count
+from amers.app.db.features.crs import Crs
+from amers.app.db.features.outlines import BLOCKS, SCENES
+from amers.app.db.features.pages import Reading
+from amers.app.db.features.query import Key, Selection
+from amers.app.db.history import HISTORY
+from amers.app.db.points import POINTS
+from amers.app.errors import InvalidParameter, NotFound
+from amers.app.usecases.features.page_tokens import format_token
+from amers.app.usecases.features.query import FeatureFilter, ResolvedQuery, condition_of, crs_of
+from amers.services.formats.vector.feature_files import Column, FeatureTable, read_feature_csv
 
 COLLECTIONS: Mapping[str, Collection] = {
     collection.id: collection for collection in (POINTS, BLOCKS, DENSITY, HISTORY, SCENES)

@@ -4,9 +4,9 @@ import base64
 import hmac
 import json
 
-from app.db.features.counts import Count
-from app.db.features.query import Key
-from app.errors import InvalidParameter
+from amers.app.db.features.counts import Count
+from amers.app.db.features.query import Key
+from amers.app.errors import InvalidParameter
 
 
 def format_token(last: Key, matched: Count, fingerprint: str, secret: bytes) -> str:

@@ -6,25 +6,25 @@ from typing import Literal
 
 import numpy as np
 
-from app.db import point_detail, points
-from app.db.engine import Connection
-from app.db.features import counts, pages
-from app.db.features.collection import Viewer
-from app.db.features.counts import Count
-from app.db.features.pages import Reading
-from app.db.features.query import Selection
-from app.db.features.serialization import csv_header
-from app.db.point_detail import PointDetail, PointView
-from app.db.points import POINTS
-from app.errors import InvalidParameter, NotFound
-from app.usecases.features.items import everything_in
-from app.usecases.features.query import MOST_FEATURES, FeatureFilter, condition_of
-from services.formats.block.tables import covariance_from_sigmas
-from services.formats.chips.images import LabelledChips
-from services.formats.chips.stacks import stream_chips_npz
-from services.formats.chips.tiff_pages import stream_chips_tiff
-from services.quality.accuracy_statement import AccuracyStatement, points_accuracy
-from services.types import Acquisition, ChipSource, ControlPoints
+from amers.app.db import point_detail, points
+from amers.app.db.engine import Connection
+from amers.app.db.features import counts, pages
+from amers.app.db.features.collection import Viewer
+from amers.app.db.features.counts import Count
+from amers.app.db.features.pages import Reading
+from amers.app.db.features.query import Selection
+from amers.app.db.features.serialization import csv_header
+from amers.app.db.point_detail import PointDetail, PointView
+from amers.app.db.points import POINTS
+from amers.app.errors import InvalidParameter, NotFound
+from amers.app.usecases.features.items import everything_in
+from amers.app.usecases.features.query import MOST_FEATURES, FeatureFilter, condition_of
+from amers.services.formats.block.tables import covariance_from_sigmas
+from amers.services.formats.chips.images import LabelledChips
+from amers.services.formats.chips.stacks import stream_chips_npz
+from amers.services.formats.chips.tiff_pages import stream_chips_tiff
+from amers.services.quality.accuracy_statement import AccuracyStatement, points_accuracy
+from amers.services.types import Acquisition, ChipSource, ControlPoints
 
 StackFormat = Literal["npz", "tif"]
 ALL = 2**40

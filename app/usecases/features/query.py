@@ -13,17 +13,17 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
 
-from app.db.features.bbox import Box
-from app.db.features.collection import Collection, Property, Viewer
-from app.db.features.counts import Count
-from app.db.features.cql2 import geometry_condition, translate, translate_text
-from app.db.features.cql2_bounds import check_size, parse_json
-from app.db.features.crs import CRS84, EARTH_RADIUS_M, EVERY, Crs
-from app.db.features.instants import parse_interval
-from app.db.features.predicates import ANYTHING, Condition, in_time, key_among
-from app.db.features.query import Key, Order, Selection
-from app.errors import InvalidParameter
-from app.usecases.features.page_tokens import parse_token
+from amers.app.db.features.bbox import Box
+from amers.app.db.features.collection import Collection, Property, Viewer
+from amers.app.db.features.counts import Count
+from amers.app.db.features.cql2 import geometry_condition, translate, translate_text
+from amers.app.db.features.cql2_bounds import check_size, parse_json
+from amers.app.db.features.crs import CRS84, EARTH_RADIUS_M, EVERY, Crs
+from amers.app.db.features.instants import parse_interval
+from amers.app.db.features.predicates import ANYTHING, Condition, in_time, key_among
+from amers.app.db.features.query import Key, Order, Selection
+from amers.app.errors import InvalidParameter
+from amers.app.usecases.features.page_tokens import parse_token
 
 DEFAULT_LIMIT = 100
 MOST_FEATURES = 10_000

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 from uuid import UUID
 
-from app.db.engine import Connection
-from app.db.scene_files import SceneFiles, read_scene_files
-from app.usecases.media_types import media_type
-from app.usecases.processes import result_name
-from app.usecases.registration.deliverables import TITLES
+from amers.app.db.engine import Connection
+from amers.app.db.scene_files import SceneFiles, read_scene_files
+from amers.app.usecases.media_types import media_type
+from amers.app.usecases.processes import result_name
+from amers.app.usecases.registration.deliverables import TITLES
 
 VERSION = "1.1.0"
 COLLECTION = "scenes"

@@ -1,10 +1,10 @@
 """Vector tiles of the collections that the map page shows."""
 
-from app.db import tiles
-from app.db.engine import Connection
-from app.db.features.collection import Viewer
-from app.db.tiles import Layer
-from app.errors import NotFound
+from amers.app.db import tiles
+from amers.app.db.engine import Connection
+from amers.app.db.features.collection import Viewer
+from amers.app.db.tiles import Layer
+from amers.app.errors import NotFound
 
 TILED = ("points", "density", "blocks")
 MATRIX_SET = "WebMercatorQuad"

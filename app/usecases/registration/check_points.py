@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from app.errors import InputError
-from services.formats.gcp.marked_points import MarkedPoints
-from services.formats.gcp.reader import read_control_points
-from services.imagery.scene import Scene
-from services.quality.check_points import CheckPoints
-from services.sensors.ortho import OrthoModel
-from services.types import Array
+from amers.app.errors import InputError
+from amers.services.formats.gcp.marked_points import MarkedPoints
+from amers.services.formats.gcp.reader import read_control_points
+from amers.services.imagery.scene import Scene
+from amers.services.quality.check_points import CheckPoints
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Array
 
 
 def read_check_points(path: Path, heights: str | None, image: Path, scene: Scene) -> CheckPoints:

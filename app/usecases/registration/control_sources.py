@@ -4,14 +4,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from app.db.engine import Database
-from app.db.points import control_points
-from app.storage import Storage
-from app.usecases.damage import open_chips
-from services.formats.block.check import check_block
-from services.formats.block.reader import FolderChips
-from services.reports.report import BlockUsed
-from services.types import Array, ChipSource, ControlPoints
+from amers.app.db.engine import Database
+from amers.app.db.points import control_points
+from amers.app.storage import Storage
+from amers.app.usecases.damage import open_chips
+from amers.services.formats.block.check import check_block
+from amers.services.formats.block.reader import FolderChips
+from amers.services.reports.report import BlockUsed
+from amers.services.types import Array, ChipSource, ControlPoints
 
 
 @dataclass(frozen=True)

@@ -4,17 +4,17 @@ from pathlib import Path
 
 import numpy as np
 
-from services.formats.gcp.json_formats import format_measures, format_opf
-from services.formats.gcp.marked_points import marked_points
-from services.formats.gcp.odm import format_gcp_list
-from services.formats.gcp.pci import format_pci_text
-from services.formats.gcp.text_formats import format_asp_gcp, format_envi_pts, format_qgis_points
-from services.formats.vector.residual_layers import exaggeration_for, write_residual_layers
-from services.reports.document import format_report
-from services.reports.html import format_html
-from services.reports.report import RegistrationReport
-from services.reports.tables import format_tables
-from services.types import Array, ControlPoints, Measures
+from amers.services.formats.gcp.json_formats import format_measures, format_opf
+from amers.services.formats.gcp.marked_points import marked_points
+from amers.services.formats.gcp.odm import format_gcp_list
+from amers.services.formats.gcp.pci import format_pci_text
+from amers.services.formats.gcp.text_formats import format_asp_gcp, format_envi_pts, format_qgis_points
+from amers.services.formats.vector.residual_layers import exaggeration_for, write_residual_layers
+from amers.services.reports.document import format_report
+from amers.services.reports.html import format_html
+from amers.services.reports.report import RegistrationReport
+from amers.services.reports.tables import format_tables
+from amers.services.types import Array, ControlPoints, Measures
 
 OUTPUTS = {
     "report.json": "The report as a document.",

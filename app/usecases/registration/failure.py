@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from app.usecases.registration.control_sources import ControlSet
-from services.errors import AmersError, CoverageError
-from services.imagery.scene import Scene
-from services.registration.context import SearchStage
-from services.registration.options import RegistrationOptions
-from services.registration.point_selection import visible_points
-from services.reports.build import scene_record
-from services.reports.document import format_report
-from services.reports.failure import (
+from amers.app.usecases.registration.control_sources import ControlSet
+from amers.services.errors import AmersError, CoverageError
+from amers.services.imagery.scene import Scene
+from amers.services.registration.context import SearchStage
+from amers.services.registration.options import RegistrationOptions
+from amers.services.registration.point_selection import visible_points
+from amers.services.reports.build import scene_record
+from amers.services.reports.document import format_report
+from amers.services.reports.failure import (
     EXPLANATION,
     FAILURE_FORMAT,
     NO_ACCURACY,
@@ -24,9 +24,9 @@ from services.reports.failure import (
     UnreadScene,
     next_steps,
 )
-from services.reports.failure_pages import format_failure_html, format_failure_tables
-from services.reports.report import BlockUsed, RunRecord
-from services.types import Array
+from amers.services.reports.failure_pages import format_failure_html, format_failure_tables
+from amers.services.reports.report import BlockUsed, RunRecord
+from amers.services.types import Array
 
 FAILURE_OUTPUTS = ("report.json", "report.html", "report.txt")
 

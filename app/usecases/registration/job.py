@@ -7,33 +7,33 @@ from tempfile import TemporaryDirectory
 from typing import Any, Literal, get_args
 from uuid import UUID
 
-from app.auth import Scope
-from app.db import scenes
-from app.db.engine import Connection
-from app.db.tokens import Token
-from app.errors import AmersError, ComputationError, InputError, TooLarge, is_no_memory
-from app.usecases.damage import suspecting_damage
-from app.usecases.processes import Commit, Process, Work, WorkFailed
-from app.usecases.references import references_of_store
-from app.usecases.registration.control_sources import points_of_store
-from app.usecases.registration.deliverables import OUTPUTS
-from app.usecases.registration.failure import FAILURE_OUTPUTS
-from app.usecases.registration.register import (
+from amers.app.auth import Scope
+from amers.app.db import scenes
+from amers.app.db.engine import Connection
+from amers.app.db.tokens import Token
+from amers.app.errors import AmersError, ComputationError, InputError, TooLarge, is_no_memory
+from amers.app.usecases.damage import suspecting_damage
+from amers.app.usecases.processes import Commit, Process, Work, WorkFailed
+from amers.app.usecases.references import references_of_store
+from amers.app.usecases.registration.control_sources import points_of_store
+from amers.app.usecases.registration.deliverables import OUTPUTS
+from amers.app.usecases.registration.failure import FAILURE_OUTPUTS
+from amers.app.usecases.registration.register import (
     ControlSources,
     SceneFiles,
     record_registration,
     run_registration,
 )
-from app.usecases.results import store_results
-from app.usecases.scene_inputs import check_file_names, check_scene, naming, present_scene
-from app.usecases.scenes import local_image, stored_keys
-from services.formats.gcp.marked_points import check_heights
-from services.formats.images.bands import parse_bands
-from services.imagery.scene import scene_gsd_m
-from services.quality.accuracy_statement import accuracy_document
-from services.registration.options import RegistrationOptions
-from services.reports.failure import NO_ACCURACY, NOT_REGISTERED
-from services.reports.report import Method as ReportedMethod
+from amers.app.usecases.results import store_results
+from amers.app.usecases.scene_inputs import check_file_names, check_scene, naming, present_scene
+from amers.app.usecases.scenes import local_image, stored_keys
+from amers.services.formats.gcp.marked_points import check_heights
+from amers.services.formats.images.bands import parse_bands
+from amers.services.imagery.scene import scene_gsd_m
+from amers.services.quality.accuracy_statement import accuracy_document
+from amers.services.registration.options import RegistrationOptions
+from amers.services.reports.failure import NO_ACCURACY, NOT_REGISTERED
+from amers.services.reports.report import Method as ReportedMethod
 
 Method = Literal["auto", "points", "reference"]
 """What a scene is registered on: control points, a reference image, or the first of both that exists."""

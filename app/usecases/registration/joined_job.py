@@ -6,20 +6,20 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from uuid import UUID
 
-from app.auth import may_access
-from app.db.engine import Connection
-from app.db.jobs import jobs
-from app.db.jobs.jobs import Job
-from app.db.tokens import Token
-from app.errors import Conflict, InputError, NoSuchJob
-from app.usecases.control_files import IMAGES_NPZ
-from app.usecases.damage import named_by_row, suspecting_damage
-from app.usecases.processes import Work
-from app.usecases.registration.joined_scenes import SCENES_JSON, JoinedScenes, Member, read_joined
-from app.usecases.results import kept_files
-from app.usecases.scene_inputs import present_scene
-from app.usecases.scenes import local_image, stored_keys
-from services.reports.failure import NOT_REGISTERED
+from amers.app.auth import may_access
+from amers.app.db.engine import Connection
+from amers.app.db.jobs import jobs
+from amers.app.db.jobs.jobs import Job
+from amers.app.db.tokens import Token
+from amers.app.errors import Conflict, InputError, NoSuchJob
+from amers.app.usecases.control_files import IMAGES_NPZ
+from amers.app.usecases.damage import named_by_row, suspecting_damage
+from amers.app.usecases.processes import Work
+from amers.app.usecases.registration.joined_scenes import SCENES_JSON, JoinedScenes, Member, read_joined
+from amers.app.usecases.results import kept_files
+from amers.app.usecases.scene_inputs import present_scene
+from amers.app.usecases.scenes import local_image, stored_keys
+from amers.services.reports.failure import NOT_REGISTERED
 
 
 def joinable_scenes(connection: Connection, caller: Token, job_id: UUID) -> list[UUID]:

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from app.usecases.control_files import IMAGES_NPZ
-from app.usecases.registration.register import SceneFiles
-from services.adjustment.known_images import KnownImages
-from services.errors import FormatError
-from services.formats.adjusted_images import read_adjusted_images
+from amers.app.usecases.control_files import IMAGES_NPZ
+from amers.app.usecases.registration.register import SceneFiles
+from amers.services.adjustment.known_images import KnownImages
+from amers.services.errors import FormatError
+from amers.services.formats.adjusted_images import read_adjusted_images
 
 SCENES_JSON = "scenes.json"
 SCENES_FORMAT = "amers-scenes/1"

@@ -7,33 +7,33 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from uuid import UUID
 
-from app.auth import Scope
-from app.db import scenes
-from app.db.engine import Connection
-from app.db.scenes import SceneRow
-from app.db.tokens import Token
-from app.errors import AmersError, ComputationError, InputError, TooLarge, is_no_memory
-from app.usecases.control_files import IMAGES_NPZ
-from app.usecases.damage import suspecting_damage
-from app.usecases.processes import Commit, Process, Work, WorkFailed
-from app.usecases.registration.control_sources import points_of_store
-from app.usecases.registration.joined_job import fetch_joined, joinable_scenes
-from app.usecases.registration.joined_scenes import SCENES_JSON
-from app.usecases.registration.register import SceneFiles, record_registration
-from app.usecases.registration.together import (
+from amers.app.auth import Scope
+from amers.app.db import scenes
+from amers.app.db.engine import Connection
+from amers.app.db.scenes import SceneRow
+from amers.app.db.tokens import Token
+from amers.app.errors import AmersError, ComputationError, InputError, TooLarge, is_no_memory
+from amers.app.usecases.control_files import IMAGES_NPZ
+from amers.app.usecases.damage import suspecting_damage
+from amers.app.usecases.processes import Commit, Process, Work, WorkFailed
+from amers.app.usecases.registration.control_sources import points_of_store
+from amers.app.usecases.registration.joined_job import fetch_joined, joinable_scenes
+from amers.app.usecases.registration.joined_scenes import SCENES_JSON
+from amers.app.usecases.registration.register import SceneFiles, record_registration
+from amers.app.usecases.registration.together import (
     JointOutcome,
     JointPlace,
     run_joint_registration,
 )
-from app.usecases.results import store_results
-from app.usecases.scene_inputs import check_scene, present_scene
-from app.usecases.scenes import local_image, stored_keys
-from services.formats.images.bands import parse_bands
-from services.imagery.scene import scene_gsd_m
-from services.quality.accuracy_statement import accuracy_document
-from services.registration.options import RegistrationOptions
-from services.reports.failure import NO_ACCURACY, NOT_REGISTERED
-from services.sensors.parameter_sets import ParameterSetName
+from amers.app.usecases.results import store_results
+from amers.app.usecases.scene_inputs import check_scene, present_scene
+from amers.app.usecases.scenes import local_image, stored_keys
+from amers.services.formats.images.bands import parse_bands
+from amers.services.imagery.scene import scene_gsd_m
+from amers.services.quality.accuracy_statement import accuracy_document
+from amers.services.registration.options import RegistrationOptions
+from amers.services.reports.failure import NO_ACCURACY, NOT_REGISTERED
+from amers.services.sensors.parameter_sets import ParameterSetName
 
 MOST_SCENES = 100
 

@@ -5,21 +5,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from app.errors import InputError
-from app.usecases.registration.control_sources import ControlSet
-from app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
-from services.formats.images.raster import RasterImage, map_grid_of, open_raster
-from services.imagery.scene import Scene
-from services.map_grid import MapGrid
-from services.matching.reference_image import Reference
-from services.registration.context import SearchStage
-from services.registration.on_points import Registration
-from services.registration.on_reference import register_on_reference
-from services.registration.options import RegistrationOptions
-from services.registration.reference_points import ReferenceChips, reference_points
-from services.reports.report import BlockUsed
-from services.sensors.ortho import OrthoModel
-from services.types import Array, Frame, Progress
+from amers.app.errors import InputError
+from amers.app.usecases.registration.control_sources import ControlSet
+from amers.app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
+from amers.services.formats.images.raster import RasterImage, map_grid_of, open_raster
+from amers.services.imagery.scene import Scene
+from amers.services.map_grid import MapGrid
+from amers.services.matching.reference_image import Reference
+from amers.services.registration.context import SearchStage
+from amers.services.registration.on_points import Registration
+from amers.services.registration.on_reference import register_on_reference
+from amers.services.registration.options import RegistrationOptions
+from amers.services.registration.reference_points import ReferenceChips, reference_points
+from amers.services.reports.report import BlockUsed
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Array, Frame, Progress
 
 LOCAL_SIGMA_PX = 0.3
 """Assumed local error of an ortho-image, independent between places: one sigma, in its own pixels."""

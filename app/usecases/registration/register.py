@@ -10,30 +10,34 @@ from uuid import UUID
 import numpy as np
 import shapely
 
-from app.db import registrations
-from app.db.engine import Connection
-from app.usecases import history
-from app.usecases.references import record_places
-from app.usecases.registration.check_points import read_check_points
-from app.usecases.registration.control_sources import ControlSet, FindPoints
-from app.usecases.registration.deliverables import write_outputs
-from app.usecases.registration.failure import Attempt, write_failure
-from app.usecases.registration.reference_source import CoveringReference, FindReference, register_on
-from services.conventions import MAX_ERROR_SIGMAS
-from services.errors import ComputationError, CoverageError, InputError
-from services.formats.images.bands import parse_bands
-from services.formats.images.scenes import read_scene
-from services.formats.sensor_models.refined_model import write_refined
-from services.geodesy import metres_per_degree
-from services.imagery.scene import Scene, scene_footprint
-from services.quality.check_points import CheckPoints, check_model, with_check_points
-from services.registration.on_points import Registration, register_scene
-from services.registration.options import RegistrationOptions
-from services.reports.build import build_report, scene_record
-from services.reports.document import report_document
-from services.reports.figure_data import figure_data
-from services.reports.report import Check, RefinedModelRecord, RegistrationReport, RunRecord
-from services.types import Array, Progress, no_progress, part_of
+from amers.app.db import registrations
+from amers.app.db.engine import Connection
+from amers.app.usecases import history
+from amers.app.usecases.references import record_places
+from amers.app.usecases.registration.check_points import read_check_points
+from amers.app.usecases.registration.control_sources import ControlSet, FindPoints
+from amers.app.usecases.registration.deliverables import write_outputs
+from amers.app.usecases.registration.failure import Attempt, write_failure
+from amers.app.usecases.registration.reference_source import (
+    CoveringReference,
+    FindReference,
+    register_on,
+)
+from amers.services.conventions import MAX_ERROR_SIGMAS
+from amers.services.errors import ComputationError, CoverageError, InputError
+from amers.services.formats.images.bands import parse_bands
+from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.sensor_models.refined_model import write_refined
+from amers.services.geodesy import metres_per_degree
+from amers.services.imagery.scene import Scene, scene_footprint
+from amers.services.quality.check_points import CheckPoints, check_model, with_check_points
+from amers.services.registration.on_points import Registration, register_scene
+from amers.services.registration.options import RegistrationOptions
+from amers.services.reports.build import build_report, scene_record
+from amers.services.reports.document import report_document
+from amers.services.reports.figure_data import figure_data
+from amers.services.reports.report import Check, RefinedModelRecord, RegistrationReport, RunRecord
+from amers.services.types import Array, Progress, no_progress, part_of
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,7 @@ class SceneFiles:
         image: of the scene.
         model: file of its model; None finds it by its name.
         sigma_m: accuracy of the model, metres; by default that of the producer or the sensor.
-        bands: to use; see `services.formats.images.bands.parse_bands`.
+        bands: to use; see `amers.services.formats.images.bands.parse_bands`.
         mask: image of the same ground; pixels are not used where it is not zero.
         check_points: file of points held out of the registration.
         check_heights: vertical datum of their heights, where their format cannot state it.

@@ -23,7 +23,7 @@ from hashlib import file_digest
 from pathlib import Path
 from typing import Any
 
-from app.errors import InputError, is_no_room
+from amers.app.errors import InputError, is_no_room
 
 MANIFEST = "manifest.json"
 RESULT_FORMAT = "amers-result/1"

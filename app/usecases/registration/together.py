@@ -10,40 +10,40 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from app.usecases.control_files import IMAGES_NPZ
-from app.usecases.executors import ComputeOptions, open_executor
-from app.usecases.registration.control_sources import ControlSet, FindPoints
-from app.usecases.registration.deliverables import write_outputs
-from app.usecases.registration.failure import Attempt, write_failure
-from app.usecases.registration.joined_scenes import (
+from amers.app.usecases.control_files import IMAGES_NPZ
+from amers.app.usecases.executors import ComputeOptions, open_executor
+from amers.app.usecases.registration.control_sources import ControlSet, FindPoints
+from amers.app.usecases.registration.deliverables import write_outputs
+from amers.app.usecases.registration.failure import Attempt, write_failure
+from amers.app.usecases.registration.joined_scenes import (
     SCENES_JSON,
     JoinedScenes,
     Member,
     format_scenes,
 )
-from app.usecases.registration.register import RegisteredScene, SceneFiles, grown
-from services.conventions import MAX_ERROR_SIGMAS
-from services.errors import AmersError, InputError
-from services.formats.adjusted_images import write_adjusted_images
-from services.formats.images.bands import parse_bands
-from services.formats.images.scenes import read_scene
-from services.formats.sensor_models.refined_model import AdjustedRigorous, write_refined
-from services.imagery.scene import Scene, scene_footprint
-from services.joint.registration import AdjustedScenes, JointRegistration, register_together
-from services.joint.results import RigorousScene
-from services.registration.on_points import Registration
-from services.registration.options import RegistrationOptions
-from services.reports.build import build_report, scene_record
-from services.reports.document import format_report
-from services.reports.figure_data import figure_data
-from services.reports.joint import JointReport, joint_report
-from services.reports.joint_pages import format_joint_html, format_joint_tables
-from services.reports.report import RefinedModelRecord, RunRecord
-from services.sensors.base import SensorModel
-from services.sensors.parameter_sets import parameter_set_named
-from services.sensors.pushbroom import PushbroomModel
-from services.tasks import Work
-from services.types import Array, Progress, no_progress, part_of
+from amers.app.usecases.registration.register import RegisteredScene, SceneFiles, grown
+from amers.services.conventions import MAX_ERROR_SIGMAS
+from amers.services.errors import AmersError, InputError
+from amers.services.formats.adjusted_images import write_adjusted_images
+from amers.services.formats.images.bands import parse_bands
+from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.sensor_models.refined_model import AdjustedRigorous, write_refined
+from amers.services.imagery.scene import Scene, scene_footprint
+from amers.services.joint.registration import AdjustedScenes, JointRegistration, register_together
+from amers.services.joint.results import RigorousScene
+from amers.services.registration.on_points import Registration
+from amers.services.registration.options import RegistrationOptions
+from amers.services.reports.build import build_report, scene_record
+from amers.services.reports.document import format_report
+from amers.services.reports.figure_data import figure_data
+from amers.services.reports.joint import JointReport, joint_report
+from amers.services.reports.joint_pages import format_joint_html, format_joint_tables
+from amers.services.reports.report import RefinedModelRecord, RunRecord
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.parameter_sets import parameter_set_named
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.tasks import Work
+from amers.services.types import Array, Progress, no_progress, part_of
 
 BLOCK_FOLDER = "block"
 """Folder of the report on all scenes, beside those of the scenes."""

@@ -6,27 +6,27 @@ from pathlib import Path
 
 import numpy.typing as npt
 
-from services.errors import FormatError
-from services.formats.block.document import BlockDocument
-from services.formats.block.document_json import BLOCK_JSON
-from services.formats.block.problems import ProblemReport
-from services.formats.block.reader import (
+from amers.services.errors import FormatError
+from amers.services.formats.block.document import BlockDocument
+from amers.services.formats.block.document_json import BLOCK_JSON
+from amers.services.formats.block.problems import ProblemReport
+from amers.services.formats.block.reader import (
     BlockContents,
     block_contents,
     block_member,
     file_sha256,
     read_document,
 )
-from services.formats.block.row_checks import check_order, check_points, check_views
-from services.formats.block.tables import (
+from amers.services.formats.block.row_checks import check_order, check_points, check_views
+from amers.services.formats.block.tables import (
     POINTS_PARQUET,
     VIEWS_PARQUET,
     PointRows,
     read_points,
     read_views,
 )
-from services.formats.chips.npy_files import ChipFile, read_chip_file
-from services.types import Progress, no_progress
+from amers.services.formats.chips.npy_files import ChipFile, read_chip_file
+from amers.services.types import Progress, no_progress
 
 CHECKSUM_THREADS = 4
 CHIP_FOLDER = "chips/"

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from services.types import UNKNOWN_FRAME, Acquisition, Array, Frame
+from amers.services.types import UNKNOWN_FRAME, Acquisition, Array, Frame
 
 NAME_PATTERN = re.compile(r"[A-Za-z][A-Za-z0-9._-]{0,99}")
 """Pattern of block names: names appear unquoted in file names, URLs and command lines."""

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from services.conventions import CHIP_SIZE
-from services.errors import FormatError
-from services.formats.block.document import (
+from amers.services.conventions import CHIP_SIZE
+from amers.services.errors import FormatError
+from amers.services.formats.block.document import (
     NAME_PATTERN,
     AccuracyFigure,
     BlockCounts,
@@ -21,8 +21,8 @@ from services.formats.block.document import (
     Provenance,
     rectangle,
 )
-from services.formats.block.frame_json import format_frame, parse_frame
-from services.types import Acquisition, Array
+from amers.services.formats.block.frame_json import format_frame, parse_frame
+from amers.services.types import Acquisition, Array
 
 BLOCK_FORMAT = "amers-block/1"
 VERTICAL_DATUM = "EPSG:4979 ellipsoidal height"

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from services.errors import FormatError
-from services.types import UNKNOWN_FRAME, Array, Frame
+from amers.services.errors import FormatError
+from amers.services.types import UNKNOWN_FRAME, Array, Frame
 
 FrameJson = dict[str, list[list[float | None]]]
 

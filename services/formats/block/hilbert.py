@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from services.types import Array, IntArray
+from amers.services.types import Array, IntArray
 
 _ORDER = 16
 

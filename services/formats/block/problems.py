@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from services.errors import FormatError
-from services.types import BoolArray
+from amers.services.errors import FormatError
+from amers.services.types import BoolArray
 
 MAX_LISTED_PROBLEMS = 20
 MAX_LISTED_ROWS = 3

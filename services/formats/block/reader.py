@@ -8,10 +8,10 @@ from types import TracebackType
 
 import numpy as np
 
-from services.errors import FormatError
-from services.formats.block.document import BlockDocument
-from services.formats.block.document_json import BLOCK_JSON, parse_block_json
-from services.formats.block.tables import (
+from amers.services.errors import FormatError
+from amers.services.formats.block.document import BlockDocument
+from amers.services.formats.block.document_json import BLOCK_JSON, parse_block_json
+from amers.services.formats.block.tables import (
     POINTS_PARQUET,
     VIEWS_PARQUET,
     Dates,
@@ -22,9 +22,9 @@ from services.formats.block.tables import (
     read_points,
     read_views,
 )
-from services.formats.chips.npy_files import ChipFile, read_chip_file
-from services.formats.members import folder_member
-from services.types import ChipArray, ControlPoints, IntArray, Views
+from amers.services.formats.chips.npy_files import ChipFile, read_chip_file
+from amers.services.formats.members import folder_member
+from amers.services.types import ChipArray, ControlPoints, IntArray, Views
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,11 @@
 import numpy as np
 import shapely
 
-from services.formats.block.document import BlockDocument
-from services.formats.block.document_json import BLOCK_JSON
-from services.formats.block.problems import ProblemReport
-from services.formats.block.tables import POINTS_PARQUET, VIEWS_PARQUET, PointRows, ViewRows
-from services.types import Array, BoolArray, IntArray
+from amers.services.formats.block.document import BlockDocument
+from amers.services.formats.block.document_json import BLOCK_JSON
+from amers.services.formats.block.problems import ProblemReport
+from amers.services.formats.block.tables import POINTS_PARQUET, VIEWS_PARQUET, PointRows, ViewRows
+from amers.services.types import Array, BoolArray, IntArray
 
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
 SMALLEST_SIGMA_M, LARGEST_SIGMA_M = 1e-6, 1e6

@@ -11,8 +11,8 @@ import pyarrow.parquet as pq
 import pyproj
 import shapely
 
-from services.errors import FormatError
-from services.types import Acquisition, Array, IntArray, SurfaceHeights
+from amers.services.errors import FormatError
+from amers.services.types import Acquisition, Array, IntArray, SurfaceHeights
 
 POINTS_PARQUET = "points.parquet"
 VIEWS_PARQUET = "views.parquet"

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from services.conventions import CHIP_SIZE
-from services.errors import FormatError, InputError
-from services.formats.block.document import NAME_PATTERN, BlockCounts, BlockDocument, BlockMetadata
-from services.formats.block.document_json import BLOCK_JSON, format_block_json
-from services.formats.block.hilbert import hilbert_order
-from services.formats.block.reader import file_sha256
-from services.formats.block.tables import (
+from amers.services.conventions import CHIP_SIZE
+from amers.services.errors import FormatError, InputError
+from amers.services.formats.block.document import NAME_PATTERN, BlockCounts, BlockDocument, BlockMetadata
+from amers.services.formats.block.document_json import BLOCK_JSON, format_block_json
+from amers.services.formats.block.hilbert import hilbert_order
+from amers.services.formats.block.reader import file_sha256
+from amers.services.formats.block.tables import (
     POINTS_PARQUET,
     VIEWS_PARQUET,
     Dates,
@@ -31,10 +31,10 @@ from services.formats.block.tables import (
     write_points,
     write_views,
 )
-from services.formats.chips.npy_files import CHIP_DTYPES, chip_file_header
-from services.formats.sensor_models.rpc_text import format_rpc_text
-from services.sensors.rpc import RpcModel
-from services.types import Acquisition, ChipArray, ControlPoints, IntArray, Progress, no_progress
+from amers.services.formats.chips.npy_files import CHIP_DTYPES, chip_file_header
+from amers.services.formats.sensor_models.rpc_text import format_rpc_text
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Acquisition, ChipArray, ControlPoints, IntArray, Progress, no_progress
 
 CHIP_FILE_BYTES = 512 * 2**20
 """Largest size of a file of chips; chips beyond it go into the next file."""

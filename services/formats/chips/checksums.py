@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import xxhash
 
-from services.formats.chips.npy_files import ChipFile
+from amers.services.formats.chips.npy_files import ChipFile
 
 CHECKSUM = np.dtype("<u4")
 """How the checksums of a file are kept: one after the other, in the order of its chips."""

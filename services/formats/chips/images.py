@@ -10,9 +10,9 @@ from rasterio.crs import CRS
 from rasterio.io import MemoryFile
 from rasterio.transform import Affine
 
-from services.conventions import CHIP_CENTRE
-from services.geodesy import metres_per_degree
-from services.types import Acquisition, Array, ChipArray
+from amers.services.conventions import CHIP_CENTRE
+from amers.services.geodesy import metres_per_degree
+from amers.services.types import Acquisition, Array, ChipArray
 
 LOW_PERCENTILE, HIGH_PERCENTILE = 1.0, 99.0
 """Percentiles of the valid pixels that a stretch maps to black and white."""

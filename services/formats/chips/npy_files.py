@@ -9,9 +9,9 @@ from typing import IO, Any
 
 import numpy as np
 
-from services.conventions import CHIP_SIZE
-from services.errors import FormatError
-from services.types import ChipArray
+from amers.services.conventions import CHIP_SIZE
+from amers.services.errors import FormatError
+from amers.services.types import ChipArray
 
 CHIP_DTYPES = (np.dtype(np.uint8), np.dtype("<u2"))
 MAX_HEADER_BYTES = 4096

@@ -11,8 +11,8 @@ import numpy.typing as npt
 from numpy.lib import format as npy
 from typing_extensions import Buffer
 
-from services.conventions import CHIP_SIZE
-from services.types import ChipArray, ChipSource, ControlPoints, IntArray
+from amers.services.conventions import CHIP_SIZE
+from amers.services.types import ChipArray, ChipSource, ControlPoints, IntArray
 
 CHIPS_PER_PIECE = 256
 """Chips in memory at once: 5 MB at 16 bits."""

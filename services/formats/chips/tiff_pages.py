@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from services.conventions import CHIP_CENTRE
-from services.formats.chips.images import pixel_size_on_ellipsoid_m
-from services.formats.chips.stacks import chip_runs, chip_table, read_runs
-from services.types import ChipArray, ChipSource, ControlPoints
+from amers.services.conventions import CHIP_CENTRE
+from amers.services.formats.chips.images import pixel_size_on_ellipsoid_m
+from amers.services.formats.chips.stacks import chip_runs, chip_table, read_runs
+from amers.services.types import ChipArray, ChipSource, ControlPoints
 
 SHORT, LONG, DOUBLE, ASCII = 3, 4, 12, 2
 CODES = {SHORT: "H", LONG: "I", DOUBLE: "d"}

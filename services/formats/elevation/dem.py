@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 from pyproj import CRS
 
-from services.errors import CoverageError, FormatError, VerticalDatumError
-from services.formats.addresses import FilePlace
-from services.formats.elevation.geoid import geoid_of_crs, geoid_of_grid, vertical_crs
-from services.formats.images.raster import RasterImage, map_grid_of, open_raster
-from services.imagery.source import ImageSource, Window
-from services.terrain import Geoid, Terrain
-from services.types import FloatImage
+from amers.services.errors import CoverageError, FormatError, VerticalDatumError
+from amers.services.formats.addresses import FilePlace
+from amers.services.formats.elevation.geoid import geoid_of_crs, geoid_of_grid, vertical_crs
+from amers.services.formats.images.raster import RasterImage, map_grid_of, open_raster
+from amers.services.imagery.source import ImageSource, Window
+from amers.services.terrain import Geoid, Terrain
+from amers.services.types import FloatImage
 
 HEIGHTS_M = (-11_100.0, 9_000.0)
 """Range of heights, from the deepest sea to above the highest mountain; others are undeclared voids."""

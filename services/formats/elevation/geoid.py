@@ -9,10 +9,10 @@ from pyproj.crs import CompoundCRS
 from pyproj.exceptions import ProjError
 from pyproj.transformer import TransformerGroup
 
-from services.errors import InputError, MissingGeoid, VerticalDatumError
-from services.map_grid import crs_of_code
-from services.terrain import Geoid
-from services.types import Array
+from amers.services.errors import InputError, MissingGeoid, VerticalDatumError
+from amers.services.map_grid import crs_of_code
+from amers.services.terrain import Geoid
+from amers.services.types import Array
 
 NAMED = {"EGM84": "EPSG:5798", "EGM96": "EPSG:5773", "EGM2008": "EPSG:3855"}
 """Codes of vertical reference systems, by their common names."""

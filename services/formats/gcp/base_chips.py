@@ -11,20 +11,20 @@ from pathlib import Path
 
 import numpy as np
 
-from services.errors import FormatError, InputError
-from services.formats.gcp.copernicus import COPERNICUS_KEY, copernicus_chips
-from services.formats.gcp.csv_points import PIXEL_ORIGINS
-from services.formats.gcp.gcplib import GcplibRecord, gcplib_records, is_gcplib
-from services.formats.images.bands import PixelCodes
-from services.formats.images.raster import map_grid_of, open_raster
-from services.formats.images.signatures import DRIVER_OF_SIGNATURE
-from services.formats.members import folder_member
-from services.formats.text_files import read_text
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, Window
-from services.map_grid import MapGrid
-from services.sensors.ortho import OrthoModel
-from services.types import Acquisition, FloatImage
+from amers.services.errors import FormatError, InputError
+from amers.services.formats.gcp.copernicus import COPERNICUS_KEY, copernicus_chips
+from amers.services.formats.gcp.csv_points import PIXEL_ORIGINS
+from amers.services.formats.gcp.gcplib import GcplibRecord, gcplib_records, is_gcplib
+from amers.services.formats.images.bands import PixelCodes
+from amers.services.formats.images.raster import map_grid_of, open_raster
+from amers.services.formats.images.signatures import DRIVER_OF_SIGNATURE
+from amers.services.formats.members import folder_member
+from amers.services.formats.text_files import read_text
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, Window
+from amers.services.map_grid import MapGrid
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Acquisition, FloatImage
 
 ABSENT = "its chip is not in the folder"
 UNREADABLE = "its chip cannot be read"

@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from services.errors import FormatError
-from services.formats.gcp.map_check import check_map_position
-from services.formats.gcp.marked_points import (
+from amers.services.errors import FormatError
+from amers.services.formats.gcp.map_check import check_map_position
+from amers.services.formats.gcp.marked_points import (
     WGS84_3D,
     Heights,
     MarkedPoints,
     marked_points,
     to_wgs84,
 )
-from services.formats.gcp.text_lines import check_lon_lat, coordinate_array
-from services.formats.text_files import load_json, parse_number
+from amers.services.formats.gcp.text_lines import check_lon_lat, coordinate_array
+from amers.services.formats.text_files import load_json, parse_number
 
 COPERNICUS_KEY = "GCP_DB"
 """The only member of the document."""

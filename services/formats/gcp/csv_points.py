@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from pyproj import CRS
 
-from services.errors import FormatError, InputError
-from services.formats.gcp.marked_points import (
+from amers.services.errors import FormatError, InputError
+from amers.services.formats.gcp.marked_points import (
     ELLIPSOID,
     Heights,
     MarkedPoints,
@@ -18,9 +18,9 @@ from services.formats.gcp.marked_points import (
     parse_crs,
     to_wgs84,
 )
-from services.formats.gcp.text_lines import check_lon_lat, coordinate_array, sequential_ids
-from services.formats.text_files import parse_number
-from services.types import Array
+from amers.services.formats.gcp.text_lines import check_lon_lat, coordinate_array, sequential_ids
+from amers.services.formats.text_files import parse_number
+from amers.services.types import Array
 
 COLUMNS = [
     "id",

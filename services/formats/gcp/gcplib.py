@@ -13,16 +13,21 @@ from datetime import date
 
 import numpy as np
 
-from services.errors import FormatError
-from services.formats.gcp.map_check import check_map_position
-from services.formats.gcp.marked_points import (
+from amers.services.errors import FormatError
+from amers.services.formats.gcp.map_check import check_map_position
+from amers.services.formats.gcp.marked_points import (
     WGS84_3D,
     Heights,
     MarkedPoints,
     marked_points,
     to_wgs84,
 )
-from services.formats.gcp.text_lines import check_lon_lat, content_lines, coordinate_array, parse_numbers
+from amers.services.formats.gcp.text_lines import (
+    check_lon_lat,
+    content_lines,
+    coordinate_array,
+    parse_numbers,
+)
 
 _FIELDS = [
     "point_id",

@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 from pyproj import CRS
 
-from services.errors import FormatError, InputError, VerticalDatumError
-from services.formats.gcp.marked_points import (
+from amers.services.errors import FormatError, InputError, VerticalDatumError
+from amers.services.formats.gcp.marked_points import (
     MarkedPoints,
     horizontal_unit_m,
     marked_points,
     parse_crs,
     to_wgs84,
 )
-from services.formats.gcp.text_lines import check_lon_lat
-from services.formats.text_files import load_json
-from services.types import Array, Measures
+from amers.services.formats.gcp.text_lines import check_lon_lat
+from amers.services.formats.text_files import load_json
+from amers.services.types import Array, Measures
 
 OPF_FORMAT = "application/opf-input-control-points+json"
 _OPF_FORMATS = (OPF_FORMAT, OPF_FORMAT.removeprefix("application/"))

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from services.errors import FormatError
-from services.map_grid import xy_of_lon_lat
+from amers.services.errors import FormatError
+from amers.services.map_grid import xy_of_lon_lat
 
 _FALSE_NORTHING_M = 10_000_000.0
 

@@ -27,14 +27,14 @@ import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
-from services.errors import FormatError, MissingGeoid, VerticalDatumError
-from services.formats.elevation.geoid import (
+from amers.services.errors import FormatError, MissingGeoid, VerticalDatumError
+from amers.services.formats.elevation.geoid import (
     geoid_of_crs,
     geoid_of_grid,
     missing_grids,
     vertical_crs,
 )
-from services.types import Array, BoolArray, StrArray
+from amers.services.types import Array, BoolArray, StrArray
 
 WGS84_3D = CRS.from_epsg(4979)
 ELLIPSOID = "ellipsoid"

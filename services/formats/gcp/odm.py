@@ -10,8 +10,8 @@ import re
 import numpy as np
 from pyproj import CRS
 
-from services.errors import FormatError
-from services.formats.gcp.marked_points import (
+from amers.services.errors import FormatError
+from amers.services.formats.gcp.marked_points import (
     ELLIPSOID,
     Heights,
     MarkedPoints,
@@ -20,7 +20,12 @@ from services.formats.gcp.marked_points import (
     parse_crs,
     to_wgs84,
 )
-from services.formats.gcp.text_lines import content_lines, coordinate_array, format_mark, parse_numbers
+from amers.services.formats.gcp.text_lines import (
+    content_lines,
+    coordinate_array,
+    format_mark,
+    parse_numbers,
+)
 
 _UTM = re.compile(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS]?)", re.IGNORECASE)
 _DEFINITION = re.compile(r"EPSG:\d+(?:\+\S+)?|\+(?:proj|init)\s*=.*", re.IGNORECASE)

@@ -12,8 +12,8 @@ import re
 
 import numpy as np
 
-from services.errors import FormatError
-from services.formats.gcp.marked_points import (
+from amers.services.errors import FormatError
+from amers.services.formats.gcp.marked_points import (
     ELLIPSOID,
     Heights,
     MarkedPoints,
@@ -21,7 +21,7 @@ from services.formats.gcp.marked_points import (
     parse_crs,
     to_wgs84,
 )
-from services.formats.gcp.text_lines import (
+from amers.services.formats.gcp.text_lines import (
     content_lines,
     coordinate_array,
     format_deg,

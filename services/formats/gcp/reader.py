@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
-from services.errors import FormatError, InputError, VerticalDatumError
-from services.formats.gcp.copernicus import COPERNICUS_KEY, parse_copernicus
-from services.formats.gcp.csv_points import PIXEL_ORIGINS, CsvLayout, is_csv, parse_csv
-from services.formats.gcp.gcplib import is_gcplib, parse_gcplib
-from services.formats.gcp.json_formats import parse_geojson_points, parse_opf
-from services.formats.gcp.marked_points import ELLIPSOID, Heights, MarkedPoints
-from services.formats.gcp.odm import is_gcp_list, parse_gcp_list
-from services.formats.gcp.pci import is_pci_text, parse_pci_text
-from services.formats.gcp.text_formats import (
+from amers.services.errors import FormatError, InputError, VerticalDatumError
+from amers.services.formats.gcp.copernicus import COPERNICUS_KEY, parse_copernicus
+from amers.services.formats.gcp.csv_points import PIXEL_ORIGINS, CsvLayout, is_csv, parse_csv
+from amers.services.formats.gcp.gcplib import is_gcplib, parse_gcplib
+from amers.services.formats.gcp.json_formats import parse_geojson_points, parse_opf
+from amers.services.formats.gcp.marked_points import ELLIPSOID, Heights, MarkedPoints
+from amers.services.formats.gcp.odm import is_gcp_list, parse_gcp_list
+from amers.services.formats.gcp.pci import is_pci_text, parse_pci_text
+from amers.services.formats.gcp.text_formats import (
     is_asp_gcp,
     is_envi_pts,
     is_qgis_points,
@@ -22,8 +22,8 @@ from services.formats.gcp.text_formats import (
     parse_envi_pts,
     parse_qgis_points,
 )
-from services.formats.text_files import read_text
-from services.types import GroundPoints
+from amers.services.formats.text_files import read_text
+from amers.services.types import GroundPoints
 
 _SAME_PLACE = np.array([1e-9, 1e-9, 1e-4])
 """Largest difference of the positions of one point in its marks: degrees, degrees, metres."""
@@ -55,7 +55,7 @@ class _Format:
 
 
 def read_control_points(path: Path, heights: Heights | None = None) -> MarkedPoints:
-    """The marked points of a file in any format of `services.formats.gcp.marked_points`.
+    """The marked points of a file in any format of `amers.services.formats.gcp.marked_points`.
 
     Args:
         path: of the file; its content decides on the format.

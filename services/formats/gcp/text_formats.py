@@ -8,8 +8,8 @@ from itertools import islice
 import numpy as np
 from pyproj import CRS
 
-from services.errors import FormatError, InputError
-from services.formats.gcp.marked_points import (
+from amers.services.errors import FormatError, InputError
+from amers.services.formats.gcp.marked_points import (
     ELLIPSOID,
     WGS84_3D,
     Heights,
@@ -18,7 +18,7 @@ from services.formats.gcp.marked_points import (
     parse_crs,
     to_wgs84,
 )
-from services.formats.gcp.text_lines import (
+from amers.services.formats.gcp.text_lines import (
     check_lon_lat,
     content_lines,
     coordinate_array,
@@ -29,8 +29,8 @@ from services.formats.gcp.text_lines import (
     parse_numbers,
     sequential_ids,
 )
-from services.formats.text_files import NUMBER_PATTERN
-from services.geodesy import ecef_from_east_north_up
+from amers.services.formats.text_files import NUMBER_PATTERN
+from amers.services.geodesy import ecef_from_east_north_up
 
 QGIS_CORNER_PX = 0.5
 """QGIS, like GDAL, counts pixels from the corner of the first one."""

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from services.errors import FormatError
-from services.formats.text_files import parse_number
-from services.types import Array
+from amers.services.errors import FormatError
+from amers.services.formats.text_files import parse_number
+from amers.services.types import Array
 
 
 def content_lines(text: str, comment: str, source: str) -> Iterator[tuple[str, str]]:

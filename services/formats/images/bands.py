@@ -4,7 +4,7 @@ import math
 import re
 from dataclasses import dataclass
 
-from services.errors import FormatError
+from amers.services.errors import FormatError
 
 _ITEM = re.compile(r"\s*(\d{1,4})\s*(?::\s*(\d+(?:\.\d*)?|\.\d+)\s*)?")
 VISIBLE = ("red", "green", "blue")

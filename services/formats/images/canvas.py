@@ -3,8 +3,8 @@
 from pathlib import Path
 from xml.sax.saxutils import escape
 
-from services.errors import InputError
-from services.formats.images.raster import open_raster
+from amers.services.errors import InputError
+from amers.services.formats.images.raster import open_raster
 
 _GDAL_TYPES = {
     "uint8": "Byte",

@@ -11,9 +11,9 @@ from weakref import WeakSet
 import rasterio
 from rasterio.errors import RasterioError
 
-from services.errors import FormatError
-from services.formats.addresses import Address, FilePlace, RangeFile
-from services.formats.images.signatures import DRIVER_OF_SIGNATURE
+from amers.services.errors import FormatError
+from amers.services.formats.addresses import Address, FilePlace, RangeFile
+from amers.services.formats.images.signatures import DRIVER_OF_SIGNATURE
 
 _SIGNATURE_BYTES = max(map(len, DRIVER_OF_SIGNATURE))
 

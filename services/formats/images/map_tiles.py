@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from services.errors import FormatError
-from services.formats.images.tiles import grey_values
-from services.orthorectification.rectify import OrthoWindow
-from services.orthorectification.tile_limits import TILE_PX, TileLimits, TilePlace
+from amers.services.errors import FormatError
+from amers.services.formats.images.tiles import grey_values
+from amers.services.orthorectification.rectify import OrthoWindow
+from amers.services.orthorectification.tile_limits import TILE_PX, TileLimits, TilePlace
 
 _QUALITY = 85
 _RECORD = np.dtype([("position", "<u8"), ("size", "<u4")])

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from services.errors import FormatError
-from services.formats.images.raster import RasterImage, open_raster
-from services.imagery.source import Window
-from services.types import FloatImage
+from amers.services.errors import FormatError
+from amers.services.formats.images.raster import RasterImage, open_raster
+from amers.services.imagery.source import Window
+from amers.services.types import FloatImage
 
 _SAME_SHAPE = 0.01
 """Largest relative difference between the pixel size ratios of mask and image along both axes."""

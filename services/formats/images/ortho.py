@@ -12,16 +12,16 @@ import rasterio.shutil
 from rasterio.transform import Affine
 from rasterio.windows import Window as RasterWindow
 
-from services.errors import FormatError
-from services.formats.images.datasets import GDAL_OPTIONS, as_format_error
-from services.formats.images.raster import (
+from amers.services.errors import FormatError
+from amers.services.formats.images.datasets import GDAL_OPTIONS, as_format_error
+from amers.services.formats.images.raster import (
     GDAL_FIRST_PIXEL,
     map_grid_of,
     open_raster,
 )
-from services.map_grid import MapGrid
-from services.orthorectification.rectify import OrthoWindow
-from services.types import FloatImage
+from amers.services.map_grid import MapGrid
+from amers.services.orthorectification.rectify import OrthoWindow
+from amers.services.types import FloatImage
 
 
 def write_refined_ortho(image_path: Path, grid: MapGrid, folder: Path, copy: bool = False) -> list[Path]:

@@ -15,15 +15,20 @@ from rasterio.enums import MaskFlags
 from rasterio.errors import NotGeoreferencedWarning
 from rasterio.windows import Window as RasterWindow
 
-from services.errors import FormatError
-from services.formats.addresses import Address, FilePlace, file_bytes
-from services.formats.images.bands import BandMix, PixelCodes, default_mix, one_band
-from services.formats.images.datasets import GDAL_CACHE, GDAL_OPTIONS, as_format_error, open_dataset
-from services.formats.images.working_copy import Pixels, open_pixels
-from services.imagery.source import Window
-from services.map_grid import MapGrid
-from services.sensors.rpc import RpcModel
-from services.types import FloatImage
+from amers.services.errors import FormatError
+from amers.services.formats.addresses import Address, FilePlace, file_bytes
+from amers.services.formats.images.bands import BandMix, PixelCodes, default_mix, one_band
+from amers.services.formats.images.datasets import (
+    GDAL_CACHE,
+    GDAL_OPTIONS,
+    as_format_error,
+    open_dataset,
+)
+from amers.services.formats.images.working_copy import Pixels, open_pixels
+from amers.services.imagery.source import Window
+from amers.services.map_grid import MapGrid
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import FloatImage
 
 # An image that is not rectified has a sensor model instead of a map grid.
 warnings.simplefilter("ignore", NotGeoreferencedWarning)

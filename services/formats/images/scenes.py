@@ -8,27 +8,27 @@ from pathlib import Path
 
 import numpy as np
 
-from services.errors import FormatError
-from services.formats.addresses import FilePlace
-from services.formats.images.bands import BandMix, PixelCodes
-from services.formats.images.masks import apply_mask
-from services.formats.images.raster import RasterImage, map_grid_of, open_raster
-from services.formats.sensor_models.dimap import (
+from amers.services.errors import FormatError
+from amers.services.formats.addresses import FilePlace
+from amers.services.formats.images.bands import BandMix, PixelCodes
+from amers.services.formats.images.masks import apply_mask
+from amers.services.formats.images.raster import RasterImage, map_grid_of, open_raster
+from amers.services.formats.sensor_models.dimap import (
     parse_dimap_acquisition,
     parse_dimap_pixel_codes,
     parse_imaging_time,
 )
-from services.formats.sensor_models.geom import parse_geom_acquisition
-from services.formats.sensor_models.rigorous_files import rigorous_model_of_image
-from services.formats.sensor_models.rpc_files import DeliveredModel, has_rpc, model_of_image
-from services.formats.sensor_models.rpc_text import rpb_satellite
-from services.formats.text_files import read_text
-from services.imagery.scene import Scene, view_direction
-from services.imagery.source import ImageSource
-from services.sensors.ortho import OrthoModel
-from services.sensors.parameter_sets import ParameterSet
-from services.sensors.rpc import RpcModel
-from services.types import Acquisition, Array
+from amers.services.formats.sensor_models.geom import parse_geom_acquisition
+from amers.services.formats.sensor_models.rigorous_files import rigorous_model_of_image
+from amers.services.formats.sensor_models.rpc_files import DeliveredModel, has_rpc, model_of_image
+from amers.services.formats.sensor_models.rpc_text import rpb_satellite
+from amers.services.formats.text_files import read_text
+from amers.services.imagery.scene import Scene, view_direction
+from amers.services.imagery.source import ImageSource
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.sensors.parameter_sets import ParameterSet
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Acquisition, Array
 
 CE90_TO_SIGMA = 1.0 / math.sqrt(2.0 * math.log(10.0))
 """Ratio of one standard deviation of each coordinate to CE90, for a circular normal law: 1 / 2.1460."""

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from services.imagery.source import ImageSource, Window
-from services.types import FloatImage, Progress, no_progress
+from amers.services.imagery.source import ImageSource, Window
+from amers.services.types import FloatImage, Progress, no_progress
 
 TILE_PX = 512
 _QUALITY = 85

@@ -11,10 +11,10 @@ import numpy as np
 import rasterio
 import rasterio.shutil
 
-from services.errors import FormatError
-from services.formats.addresses import Address, FilePlace
-from services.formats.images.datasets import GDAL_OPTIONS, as_format_error
-from services.formats.images.layout import largest_piece_bytes
+from amers.services.errors import FormatError
+from amers.services.formats.addresses import Address, FilePlace
+from amers.services.formats.images.datasets import GDAL_OPTIONS, as_format_error
+from amers.services.formats.images.layout import largest_piece_bytes
 
 MIB = 1 << 20
 READ_BY_WINDOWS_BYTES = 16 * MIB

@@ -3,7 +3,7 @@
 import csv
 import io
 
-from services.sensors.moving_pushbroom import AttitudeMotion
+from amers.services.sensors.moving_pushbroom import AttitudeMotion
 
 ATTITUDE_CSV = "attitude.csv"
 _HEADINGS = "line", "time_s", "roll_urad", "pitch_urad"

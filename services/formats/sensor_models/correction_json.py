@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from services.errors import FormatError
-from services.formats.text_files import load_json
-from services.quality.correction_accuracy import CorrectionAccuracy
-from services.sensors.correction import ImageCorrection
-from services.sensors.displacement import DisplacementGrid
-from services.types import UNKNOWN_FRAME, Array, Frame
+from amers.services.errors import FormatError
+from amers.services.formats.text_files import load_json
+from amers.services.quality.correction_accuracy import CorrectionAccuracy
+from amers.services.sensors.correction import ImageCorrection
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.types import UNKNOWN_FRAME, Array, Frame
 
 CORRECTION_FORMAT = "amers-image-correction/1"
 PROFILE_FORMAT = "amers-image-correction/2"

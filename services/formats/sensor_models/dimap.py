@@ -13,14 +13,14 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from services.errors import FormatError
-from services.formats.images.bands import PixelCodes
-from services.formats.sensor_models.rpc_text import rpc_from_numbers
-from services.formats.sensor_models.xml_values import parse_xml, single
-from services.formats.text_files import parse_number
-from services.sensors.rpc import RpcModel
-from services.sensors.rpc_fit import fit_to_ground
-from services.types import Acquisition, Array
+from amers.services.errors import FormatError
+from amers.services.formats.images.bands import PixelCodes
+from amers.services.formats.sensor_models.rpc_text import rpc_from_numbers
+from amers.services.formats.sensor_models.xml_values import parse_xml, single
+from amers.services.formats.text_files import parse_number
+from amers.services.sensors.rpc import RpcModel
+from amers.services.sensors.rpc_fit import fit_to_ground
+from amers.services.types import Acquisition, Array
 
 _PROFILES = {"PHR": "PHR", "S6": "SPOT6", "S7": "SPOT7", "PNEO": "PNEO"}
 _FOLD_TOLERANCE_PX = 1e-7

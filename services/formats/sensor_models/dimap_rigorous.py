@@ -4,8 +4,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from services.errors import FormatError
-from services.formats.sensor_models.xml_values import (
+from amers.services.errors import FormatError
+from amers.services.formats.sensor_models.xml_values import (
     check_increasing,
     midnight_before,
     number,
@@ -15,22 +15,22 @@ from services.formats.sensor_models.xml_values import (
     single,
     whole_number,
 )
-from services.sensors.attitude import interpolated_attitude
-from services.sensors.piecewise import (
+from amers.services.sensors.attitude import interpolated_attitude
+from amers.services.sensors.piecewise import (
     LAGRANGE_NODES,
     extended,
     hermite,
     lagrange,
     polynomial,
 )
-from services.sensors.pushbroom import (
+from amers.services.sensors.pushbroom import (
     MAX_SIZE,
     TERRAIN_M,
     PushbroomModel,
     check_pushbroom,
     used_times,
 )
-from services.types import Array
+from amers.services.types import Array
 
 _PERIOD_UNITS_S = {"microsecond": 1e-6, "ms": 1e-3, "millisecond": 1e-3, "s": 1.0, "second": 1.0}
 _MAX_DEGREE = 9

@@ -9,17 +9,17 @@ import math
 import re
 from collections.abc import Mapping
 
-from services.errors import FormatError
-from services.formats.sensor_models.dimap import parse_imaging_time
-from services.formats.sensor_models.rpc_text import (
+from amers.services.errors import FormatError
+from amers.services.formats.sensor_models.dimap import parse_imaging_time
+from amers.services.formats.sensor_models.rpc_text import (
     RPC00A_ORDER,
     Numbers,
     named_numbers,
     rpc_from_numbers,
 )
-from services.formats.text_files import parse_number
-from services.sensors.rpc import RpcModel
-from services.types import Acquisition
+from amers.services.formats.text_files import parse_number
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Acquisition
 
 _KEYS = {
     "ERR_BIAS": "bias_error",

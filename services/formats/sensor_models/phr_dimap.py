@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from services.errors import FormatError
-from services.formats.sensor_models.xml_values import (
+from amers.services.errors import FormatError
+from amers.services.formats.sensor_models.xml_values import (
     check_increasing,
     midnight_before,
     number,
@@ -13,15 +13,15 @@ from services.formats.sensor_models.xml_values import (
     single,
     whole_number,
 )
-from services.sensors.piecewise import extended, lagrange, polynomial
-from services.sensors.pushbroom import (
+from amers.services.sensors.piecewise import extended, lagrange, polynomial
+from amers.services.sensors.pushbroom import (
     MAX_SIZE,
     TERRAIN_M,
     PushbroomModel,
     check_pushbroom,
     used_times,
 )
-from services.types import Array
+from amers.services.types import Array
 
 _ROOT = "PHR_Dimap_Document"
 

@@ -3,26 +3,26 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from services.adjustment.image_correction import SceneAdjustment
-from services.formats.images.ortho import write_refined_ortho
-from services.formats.images.raster import open_raster
-from services.formats.sensor_models.attitude_csv import ATTITUDE_CSV, format_attitude
-from services.formats.sensor_models.correction_json import format_correction
-from services.formats.sensor_models.rpc_files import (
+from amers.services.adjustment.image_correction import SceneAdjustment
+from amers.services.formats.images.ortho import write_refined_ortho
+from amers.services.formats.images.raster import open_raster
+from amers.services.formats.sensor_models.attitude_csv import ATTITUDE_CSV, format_attitude
+from amers.services.formats.sensor_models.correction_json import format_correction
+from amers.services.formats.sensor_models.rpc_files import (
     DeliveredModel,
     has_rpc,
     model_of_image,
     read_rpc,
     write_model,
 )
-from services.map_grid import MapGrid
-from services.sensors.base import SensorModel
-from services.sensors.correction import CorrectedModel
-from services.sensors.moving_pushbroom import AttitudeMotion
-from services.sensors.ortho import OrthoModel, fold_into_ortho
-from services.sensors.refined import LOUD_PX, REFIT_LIMIT_PX, refined_rpc
-from services.sensors.rpc import RpcModel
-from services.types import UNKNOWN_FRAME, Frame
+from amers.services.map_grid import MapGrid
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.correction import CorrectedModel
+from amers.services.sensors.moving_pushbroom import AttitudeMotion
+from amers.services.sensors.ortho import OrthoModel, fold_into_ortho
+from amers.services.sensors.refined import LOUD_PX, REFIT_LIMIT_PX, refined_rpc
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import UNKNOWN_FRAME, Frame
 
 CORRECTION_JSON = "correction.json"
 FIT_LIMIT_PX = 0.1

@@ -4,13 +4,13 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
-from services.errors import FormatError
-from services.formats.addresses import FilePlace
-from services.formats.images.raster import RasterImage
-from services.formats.sensor_models.rigorous_model import rigorous_model_in
-from services.formats.sensor_models.rpc_files import crop_offset, files_named
-from services.formats.text_files import read_text
-from services.sensors.pushbroom import PushbroomModel
+from amers.services.errors import FormatError
+from amers.services.formats.addresses import FilePlace
+from amers.services.formats.images.raster import RasterImage
+from amers.services.formats.sensor_models.rigorous_model import rigorous_model_in
+from amers.services.formats.sensor_models.rpc_files import crop_offset, files_named
+from amers.services.formats.text_files import read_text
+from amers.services.sensors.pushbroom import PushbroomModel
 
 
 class DeliveredRigorousModel(NamedTuple):

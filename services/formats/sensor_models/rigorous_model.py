@@ -4,15 +4,15 @@ from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
 
-from services.errors import FormatError
-from services.formats.sensor_models.dimap_rigorous import parse_dimap_rigorous
-from services.formats.sensor_models.phr_dimap import parse_phr_dimap
-from services.formats.sensor_models.spot_dimap import parse_spot_dimap
-from services.formats.sensor_models.worldview_isd import parse_worldview_isd
-from services.formats.sensor_models.xml_values import parse_xml
-from services.formats.text_files import read_text
-from services.sensors.pushbroom import PushbroomModel
-from services.sensors.rpc_fit import RpcFit, fit_rpc
+from amers.services.errors import FormatError
+from amers.services.formats.sensor_models.dimap_rigorous import parse_dimap_rigorous
+from amers.services.formats.sensor_models.phr_dimap import parse_phr_dimap
+from amers.services.formats.sensor_models.spot_dimap import parse_spot_dimap
+from amers.services.formats.sensor_models.worldview_isd import parse_worldview_isd
+from amers.services.formats.sensor_models.xml_values import parse_xml
+from amers.services.formats.text_files import read_text
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.sensors.rpc_fit import RpcFit, fit_rpc
 
 _READERS: dict[tuple[str, str], Callable[[str, str], PushbroomModel]] = {
     ("PHR_Dimap_Document", ""): parse_phr_dimap,

@@ -8,13 +8,13 @@ from typing import Literal
 
 import numpy as np
 
-from services.errors import FormatError
-from services.formats.addresses import Address, FilePlace
-from services.formats.images.raster import RasterImage, copy_with_rpc, open_raster
-from services.formats.sensor_models.dimap import format_dimap_rpc, parse_dimap_rpc
-from services.formats.sensor_models.geom import format_geom, is_geom, parse_geom
-from services.formats.sensor_models.rigorous_model import rpc_of_rigorous_model
-from services.formats.sensor_models.rpc_text import (
+from amers.services.errors import FormatError
+from amers.services.formats.addresses import Address, FilePlace
+from amers.services.formats.images.raster import RasterImage, copy_with_rpc, open_raster
+from amers.services.formats.sensor_models.dimap import format_dimap_rpc, parse_dimap_rpc
+from amers.services.formats.sensor_models.geom import format_geom, is_geom, parse_geom
+from amers.services.formats.sensor_models.rigorous_model import rpc_of_rigorous_model
+from amers.services.formats.sensor_models.rpc_text import (
     RPC00A_ORDER,
     format_rpb,
     format_rpc_text,
@@ -23,8 +23,8 @@ from services.formats.sensor_models.rpc_text import (
     rpb_satellite,
     rpc_from_numbers,
 )
-from services.formats.text_files import parse_number, read_text
-from services.sensors.rpc import RpcModel, check_rpc
+from amers.services.formats.text_files import parse_number, read_text
+from amers.services.sensors.rpc import RpcModel, check_rpc
 
 Convention = Literal["tags", "text", "rpb", "dimap", "geom", "rigorous"]
 

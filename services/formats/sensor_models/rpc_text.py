@@ -10,10 +10,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from services.errors import FormatError
-from services.formats.text_files import NUMBER_PATTERN, parse_number
-from services.sensors.rpc import RpcModel
-from services.types import Array
+from amers.services.errors import FormatError
+from amers.services.formats.text_files import NUMBER_PATTERN, parse_number
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Array
 
 Numbers = Callable[[str], float]
 """Returns the number of a key in the names of GDAL, such as `LINE_OFF` or `SAMP_DEN_COEFF_20`."""

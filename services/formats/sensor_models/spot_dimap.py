@@ -5,8 +5,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from services.errors import FormatError
-from services.formats.sensor_models.xml_values import (
+from amers.services.errors import FormatError
+from amers.services.formats.sensor_models.xml_values import (
     check_increasing,
     midnight_before,
     number,
@@ -15,8 +15,8 @@ from services.formats.sensor_models.xml_values import (
     single,
     whole_number,
 )
-from services.sensors.attitude import integrated_rates, orbital_attitude
-from services.sensors.piecewise import (
+from amers.services.sensors.attitude import integrated_rates, orbital_attitude
+from amers.services.sensors.piecewise import (
     PiecewisePolynomial,
     extended,
     from_function,
@@ -24,14 +24,14 @@ from services.sensors.piecewise import (
     linear,
     polynomial,
 )
-from services.sensors.pushbroom import (
+from amers.services.sensors.pushbroom import (
     MAX_SIZE,
     TERRAIN_M,
     PushbroomModel,
     check_pushbroom,
     used_times,
 )
-from services.types import Array
+from amers.services.types import Array
 
 _ANGLES = ("YAW", "PITCH", "ROLL")
 _TABLE_FROM = 100

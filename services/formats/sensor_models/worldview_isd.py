@@ -5,8 +5,8 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from services.errors import FormatError
-from services.formats.sensor_models.xml_values import (
+from amers.services.errors import FormatError
+from amers.services.formats.sensor_models.xml_values import (
     check_increasing,
     midnight_before,
     number,
@@ -16,17 +16,17 @@ from services.formats.sensor_models.xml_values import (
     single,
     whole_number,
 )
-from services.sensors.attitude import interpolated_attitude
-from services.sensors.light_path import LightPath
-from services.sensors.piecewise import extended, lagrange, linear, polynomial
-from services.sensors.pushbroom import (
+from amers.services.sensors.attitude import interpolated_attitude
+from amers.services.sensors.light_path import LightPath
+from amers.services.sensors.piecewise import extended, lagrange, linear, polynomial
+from amers.services.sensors.pushbroom import (
     MAX_SIZE,
     TERRAIN_M,
     PushbroomModel,
     check_pushbroom,
     used_times,
 )
-from services.types import Array
+from amers.services.types import Array
 
 _LIGHT_PATH = LightPath(velocity_aberration=True, light_time=True, refraction=True)
 

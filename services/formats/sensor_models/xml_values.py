@@ -6,9 +6,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from services.errors import FormatError
-from services.formats.text_files import parse_number
-from services.types import Array
+from amers.services.errors import FormatError
+from amers.services.formats.text_files import parse_number
+from amers.services.types import Array
 
 _TIME = re.compile(r"(\d{4}-\d\d-\d\d)T(\d\d:\d\d:\d\d)(\.\d{1,12})?Z?")
 

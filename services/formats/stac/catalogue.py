@@ -10,15 +10,15 @@ from typing import IO, Any
 import numpy as np
 import shapely
 
-from services.errors import FormatError
-from services.formats.addresses import without_query
-from services.formats.stac.documents import Documents, absolute_address, json_bytes
-from services.formats.stac.items import StacImage, parse_item, parse_polygons
-from services.formats.stac.walk import walk
-from services.formats.text_files import load_json
-from services.imagery.catalogue import ImageCatalogue
-from services.imagery.footprints import footprint_on_ground
-from services.types import Progress, no_progress
+from amers.services.errors import FormatError
+from amers.services.formats.addresses import without_query
+from amers.services.formats.stac.documents import Documents, absolute_address, json_bytes
+from amers.services.formats.stac.items import StacImage, parse_item, parse_polygons
+from amers.services.formats.stac.walk import walk
+from amers.services.formats.text_files import load_json
+from amers.services.imagery.catalogue import ImageCatalogue
+from amers.services.imagery.footprints import footprint_on_ground
+from amers.services.types import Progress, no_progress
 
 MOST_PROBLEMS = 20
 """Number of problems whose words are kept; all are counted."""

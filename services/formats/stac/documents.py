@@ -11,9 +11,9 @@ from types import TracebackType
 from typing import Any, Self
 from urllib.parse import unquote, urljoin, urlsplit
 
-from services.errors import FormatError
-from services.formats.addresses import SCHEMES, Address, without_query
-from services.formats.text_files import load_json
+from amers.services.errors import FormatError
+from amers.services.formats.addresses import SCHEMES, Address, without_query
+from amers.services.formats.text_files import load_json
 
 LARGEST_DOCUMENT_BYTES = 512_000_000
 LARGEST_REPLY_BYTES = 64_000_000

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 import shapely
 
-from services.errors import FormatError
-from services.imagery.footprints import footprint_on_ground
+from amers.services.errors import FormatError
+from amers.services.imagery.footprints import footprint_on_ground
 
 MASK_ROLES = frozenset({"cloud", "cloud-shadow", "snow-ice"})
 """Roles of assets that show what hides the ground (STAC best practices, asset roles)."""
@@ -38,7 +38,7 @@ Json = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class StacImage:
-    """What an item states of its image; see `services.imagery.catalogue.ImageCatalogue`.
+    """What an item states of its image; see `amers.services.imagery.catalogue.ImageCatalogue`.
 
     Attributes:
         key: collection and id, which identify the item.

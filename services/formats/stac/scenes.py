@@ -7,12 +7,12 @@ from urllib.parse import unquote, urlsplit
 
 import shapely
 
-from services.errors import FormatError
-from services.formats.addresses import Address, FilePlace, file_place
-from services.formats.images.scenes import read_scene
-from services.formats.stac.items import Json, parse_item
-from services.imagery.hidden import without_hidden_ground
-from services.imagery.scene import Scene
+from amers.services.errors import FormatError
+from amers.services.formats.addresses import Address, FilePlace, file_place
+from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.stac.items import Json, parse_item
+from amers.services.imagery.hidden import without_hidden_ground
+from amers.services.imagery.scene import Scene
 
 _IMAGE_TYPES = ("image/tiff", "image/jp2", "application/vnd.nitf")
 _IMAGE_NAMES = (".tif", ".tiff", ".jp2", ".ntf", ".nitf")

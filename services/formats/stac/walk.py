@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, urlencode, urlsplit, urlunsplit
 
-from services.errors import FormatError
-from services.formats.addresses import without_query
-from services.formats.stac.documents import Documents, is_address
-from services.formats.text_files import load_json
+from amers.services.errors import FormatError
+from amers.services.formats.addresses import without_query
+from amers.services.formats.stac.documents import Documents, is_address
+from amers.services.formats.text_files import load_json
 
 PAGE_ITEMS = 250
 MOST_DOCUMENTS = 2_000_000

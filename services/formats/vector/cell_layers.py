@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from services.types import Array
+from amers.services.types import Array
 
 
 def write_cell_layer(

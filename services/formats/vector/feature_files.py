@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pyproj
 import shapely
 
-from services.formats.vector.qgis_styles import LAYER_STYLES, add_styles
+from amers.services.formats.vector.qgis_styles import LAYER_STYLES, add_styles
 
 KEYS = "keys"
 """Column of a CSV with the paging key of each row."""

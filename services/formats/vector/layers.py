@@ -22,9 +22,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import shapely
 
-from services.errors import FormatError, InputError
-from services.formats.vector.plain_geojson import plain_geojson
-from services.types import IntArray
+from amers.services.errors import FormatError, InputError
+from amers.services.formats.vector.plain_geojson import plain_geojson
+from amers.services.types import IntArray
 
 DRIVERS = {
     ".gpkg": "GPKG",

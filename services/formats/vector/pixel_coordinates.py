@@ -11,8 +11,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from services.errors import InputError
-from services.types import Array, BoolArray
+from amers.services.errors import InputError
+from amers.services.types import Array, BoolArray
 
 PixelOrigin = Literal["qgis", "corner", "centre"]
 PIXEL_ORIGINS: tuple[PixelOrigin, ...] = get_args(PixelOrigin)

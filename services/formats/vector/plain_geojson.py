@@ -12,8 +12,8 @@ from typing import Any
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from services.errors import FormatError
-from services.formats.text_files import load_json
+from amers.services.errors import FormatError
+from amers.services.formats.text_files import load_json
 
 MOST_PARTS = 1_000_000
 """Parts of collections that are looked at: more than a body of the largest size has."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 from xml.etree import ElementTree as ET
 
-from services.conventions import STATUS_COLOURS
+from amers.services.conventions import STATUS_COLOURS
 
 COLOURS = ("#440154", "#3b528b", "#21918c", "#5ec962", "#fde725")
 """Viridis, of the classes of a number; readable with every colour vision."""

@@ -6,10 +6,10 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from services.formats.gcp.json_formats import measured_numbers
-from services.formats.vector.qgis_styles import add_styles
-from services.geodesy import metres_per_degree_at, wrapped_degrees
-from services.types import Measures
+from amers.services.formats.gcp.json_formats import measured_numbers
+from amers.services.formats.vector.qgis_styles import add_styles
+from amers.services.geodesy import metres_per_degree_at, wrapped_degrees
+from amers.services.types import Measures
 
 CRS_3D = "EPSG:4979"
 """Longitude, latitude, height above the WGS 84 ellipsoid."""

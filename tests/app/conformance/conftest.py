@@ -10,13 +10,13 @@ import pytest
 from fastapi.testclient import TestClient
 from pydantic import SecretStr
 
-from app.config import Settings
-from app.db import engine
-from app.db.cluster.embedded import Cluster
-from app.main import create_app
-from app.storage import Storage
-from app.usecases.blocks import lifecycle
-from app.usecases.tokens import create_token
+from amers.app.config import Settings
+from amers.app.db import engine
+from amers.app.db.cluster.embedded import Cluster
+from amers.app.main import create_app
+from amers.app.storage import Storage
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.tokens import create_token
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.factories import MadeBlock, make_block
 from tests.statements import run_sql

@@ -5,7 +5,7 @@ import re
 import pytest
 from openapi_spec_validator import OpenAPIV30SpecValidator, OpenAPIV31SpecValidator
 
-from app.api.openapi_30 import as_openapi_30
+from amers.app.api.openapi_30 import as_openapi_30
 from tests.app.conformance.conftest import COLLECTIONS
 
 OAS_31 = "application/vnd.oai.openapi+json;version=3.1"

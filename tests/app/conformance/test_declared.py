@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from app.api.system import CONFORMS_TO
+from amers.app.api.system import CONFORMS_TO
 
 OGC = "http://www.opengis.net/spec/"
 TESTS_OF_CLASS = {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from app.db import engine
+from amers.app.db import engine
 from tests.statements import run_sql
 
 COLLECTIONS = ("points", "blocks", "density", "point-history")

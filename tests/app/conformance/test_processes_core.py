@@ -11,13 +11,13 @@ import pytest
 from fastapi.testclient import TestClient
 from jsonschema import Draft202012Validator, validate
 
-from app.db import engine
-from app.db.jobs import attempts
-from app.db.jobs.jobs import Job
-from app.storage import Storage
-from app.usecases import results
-from app.usecases.jobs import PROCESSES, error_details
-from services.errors import NotEnoughPoints
+from amers.app.db import engine
+from amers.app.db.jobs import attempts
+from amers.app.db.jobs.jobs import Job
+from amers.app.storage import Storage
+from amers.app.usecases import results
+from amers.app.usecases.jobs import PROCESSES, error_details
+from amers.services.errors import NotEnoughPoints
 from tests.app.job_queue import claim
 from tests.statements import run_sql
 

@@ -8,9 +8,9 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from app.db.features.outlines import SCENES
-from app.db.features.predicates import BoxShape, box_predicate
-from app.db.points import POINTS
+from amers.app.db.features.outlines import SCENES
+from amers.app.db.features.predicates import BoxShape, box_predicate
+from amers.app.db.points import POINTS
 from tests.app.conformance.conftest import COLLECTIONS, TAKEN
 
 FIRST, LAST = "2023-03-01", "2023-06-09"

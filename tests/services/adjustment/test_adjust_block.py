@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, f
 
-from services.adjustment.affine_fit import ORDERS, Order
-from services.adjustment.block_problem import BlockOptions
-from services.adjustment.bundle import BlockAdjustment, adjust_block
-from services.adjustment.intersection import intersect
-from services.adjustment.parameters import image_parameters
-from services.errors import NoConvergence, NotEnoughPoints
-from services.sensors.correction import CorrectedModel
-from services.sensors.displacement import DisplacementGrid
-from services.simulation.view import ViewGeometry
-from services.types import Array, Observations
+from amers.services.adjustment.affine_fit import ORDERS, Order
+from amers.services.adjustment.block_problem import BlockOptions
+from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
+from amers.services.adjustment.intersection import intersect
+from amers.services.adjustment.parameters import image_parameters
+from amers.services.errors import NoConvergence, NotEnoughPoints
+from amers.services.sensors.correction import CorrectedModel
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.simulation.view import ViewGeometry
+from amers.services.types import Array, Observations
 from tests.services.simulated import ring_of_geometries
 from tests.services.ties import Ties, difference_m, make_ties, whitened_square
 

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from services.adjustment.affine_fit import FREE, AffineFit, Order
-from services.adjustment.control_observations import ControlObservations
-from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
-from services.adjustment.shared_errors import offset_sigma_px, overlap_correlation
-from services.errors import NotEnoughPoints, UndeterminedCorrection
-from services.sensors.correction import ImageCorrection, no_correction
-from services.types import Array, BoolArray
+from amers.services.adjustment.affine_fit import FREE, AffineFit, Order
+from amers.services.adjustment.control_observations import ControlObservations
+from amers.services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
+from amers.services.adjustment.shared_errors import offset_sigma_px, overlap_correlation
+from amers.services.errors import NotEnoughPoints, UndeterminedCorrection
+from amers.services.sensors.correction import ImageCorrection, no_correction
+from amers.services.types import Array, BoolArray
 from tests.services.conftest import GSD_M, SHAPE, FlatModel
 
 DEFAULTS = AdjustmentOptions()

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from services.adjustment.bends import bends
-from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
-from services.adjustment.structure import Residuals
-from services.quality.normal_law import normal_ce90
-from services.types import Array
+from amers.services.adjustment.bends import bends
+from amers.services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
+from amers.services.adjustment.structure import Residuals
+from amers.services.quality.normal_law import normal_ce90
+from amers.services.types import Array
 from tests.services.adjustment.test_displacement_components import (
     SHAPE,
     WRONG,

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
+from amers.services.adjustment.control_ground import ControlGround
+from amers.services.errors import NoConsensus
+from amers.services.geodesy import move_metres
+from amers.services.types import UNKNOWN_FRAME, Array, Frame, Observations
 from benchmarks.block_coverage import Case, draw
-from services.adjustment.bundle import BlockAdjustment, adjust_block
-from services.adjustment.control_ground import ControlGround
-from services.errors import NoConsensus
-from services.geodesy import move_metres
-from services.types import UNKNOWN_FRAME, Array, Frame, Observations
 from tests.services.ties import difference_m
 
 point_sigma_m = 0.3

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from amers.services.adjustment.bundle import adjust_block
+from amers.services.errors import DisconnectedBlock
 from benchmarks.block_coverage import Case, draw, measure
-from services.adjustment.bundle import adjust_block
-from services.errors import DisconnectedBlock
 
 pytestmark = pytest.mark.thorough
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from services.adjustment.block_scale import low_scale, magnitude, posterior_scale, robust_scale
-from services.adjustment.control_ground import ControlGround, joined_ground
-from services.types import Frame, IntArray
+from amers.services.adjustment.block_scale import low_scale, magnitude, posterior_scale, robust_scale
+from amers.services.adjustment.control_ground import ControlGround, joined_ground
+from amers.services.types import Frame, IntArray
 
 RAYS, POINTS, SHARED = 3, 30, 24
 NOISE = 1.5

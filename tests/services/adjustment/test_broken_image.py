@@ -6,15 +6,15 @@ from itertools import product
 import numpy as np
 import pytest
 
-from services.adjustment.broken_image import held_parts, placed_steps
-from services.adjustment.control_observations import ControlObservations
-from services.adjustment.displacement_components import Component
-from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
-from services.quality.accuracy import normalised_error
-from services.quality.normal_law import normal_ce90
-from services.sensors.correction import ImageCorrection, no_correction
-from services.sensors.displacement import DisplacementGrid
-from services.types import Array, IntArray
+from amers.services.adjustment.broken_image import held_parts, placed_steps
+from amers.services.adjustment.control_observations import ControlObservations
+from amers.services.adjustment.displacement_components import Component
+from amers.services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
+from amers.services.quality.accuracy import normalised_error
+from amers.services.quality.normal_law import normal_ce90
+from amers.services.sensors.correction import ImageCorrection, no_correction
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.types import Array, IntArray
 from tests.services.conftest import FlatModel
 
 SHAPE = (4000, 3000)

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from services.adjustment.block_accuracy import block_accuracy
-from services.adjustment.block_problem import BlockOptions, BlockProblem
-from services.adjustment.block_solution import checked_gauge, least_squares
-from services.adjustment.bundle import adjust_block
-from services.adjustment.control_check import agreeing_control
-from services.adjustment.control_ground import ControlGround
-from services.adjustment.parameters import AdjustableImage, block_priors, image_parameters
-from services.adjustment.robust_start import active_observations, robust_start
-from services.geodesy import move_metres
-from services.types import Array, BoolArray, Frame, Observations
+from amers.services.adjustment.block_accuracy import block_accuracy
+from amers.services.adjustment.block_problem import BlockOptions, BlockProblem
+from amers.services.adjustment.block_solution import checked_gauge, least_squares
+from amers.services.adjustment.bundle import adjust_block
+from amers.services.adjustment.control_check import agreeing_control
+from amers.services.adjustment.control_ground import ControlGround
+from amers.services.adjustment.parameters import AdjustableImage, block_priors, image_parameters
+from amers.services.adjustment.robust_start import active_observations, robust_start
+from amers.services.geodesy import move_metres
+from amers.services.types import Array, BoolArray, Frame, Observations
 from tests.services.simulated import ring_of_geometries
 from tests.services.ties import difference_m, make_ties
 

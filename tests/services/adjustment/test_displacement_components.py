@@ -6,16 +6,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from services.adjustment.control_observations import ControlObservations
-from services.adjustment.displacement_components import MAX_CHANCE
-from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
-from services.adjustment.structure import Family
-from services.quality.accuracy import normalised_error
-from services.quality.normal_law import normal_ce90, overall_ce90
-from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
-from services.sensors.displacement import DisplacementGrid
-from services.sensors.refined import LOUD_PX, refined_rpc
-from services.types import Array
+from amers.services.adjustment.control_observations import ControlObservations
+from amers.services.adjustment.displacement_components import MAX_CHANCE
+from amers.services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
+from amers.services.adjustment.structure import Family
+from amers.services.quality.accuracy import normalised_error
+from amers.services.quality.normal_law import normal_ce90, overall_ce90
+from amers.services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.sensors.refined import LOUD_PX, refined_rpc
+from amers.services.types import Array
 from tests.services.conftest import FlatModel
 
 SHAPE = (4000, 3000)

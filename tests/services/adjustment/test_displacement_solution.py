@@ -7,21 +7,21 @@ import pytest
 from scipy.linalg import null_space
 from scipy.stats import multivariate_normal
 
-from services.adjustment.affine_fit import AffineFit
-from services.adjustment.displacement_components import (
+from amers.services.adjustment.affine_fit import AffineFit
+from amers.services.adjustment.displacement_components import (
     MAX_CHANCE,
     Component,
     likeliest_components,
     unit_variance,
     with_components,
 )
-from services.adjustment.displacement_solution import agreeing_with, by_affine, solve_displacement
-from services.adjustment.placed_measures import PlacedMeasures
-from services.adjustment.scene_solution import AgreeingMeasures
-from services.adjustment.shared_errors import SharedErrors
-from services.adjustment.structure import Residuals, structures
-from services.sensors.correction import no_correction
-from services.types import Array, BoolArray
+from amers.services.adjustment.displacement_solution import agreeing_with, by_affine, solve_displacement
+from amers.services.adjustment.placed_measures import PlacedMeasures
+from amers.services.adjustment.scene_solution import AgreeingMeasures
+from amers.services.adjustment.shared_errors import SharedErrors
+from amers.services.adjustment.structure import Residuals, structures
+from amers.services.sensors.correction import no_correction
+from amers.services.types import Array, BoolArray
 
 SHAPE = (4000, 3000)
 EXTENT_PX = 3500.0

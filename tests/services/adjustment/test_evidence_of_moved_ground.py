@@ -6,9 +6,9 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from services.adjustment.control_observations import ControlObservations
-from services.adjustment.image_correction import SceneAdjustment, adjust_scene
-from services.types import Array, BoolArray
+from amers.services.adjustment.control_observations import ControlObservations
+from amers.services.adjustment.image_correction import SceneAdjustment, adjust_scene
+from amers.services.types import Array, BoolArray
 from tests.services.adjustment.test_displacement_components import SHAPE, draw
 from tests.services.adjustment.test_moved_ground import landslide
 from tests.services.conftest import FlatModel

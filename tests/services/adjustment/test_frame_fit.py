@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from services.adjustment.control_ground import ControlGround
-from services.adjustment.frame_fit import FrameFit, fit_frame
-from services.errors import NoConsensus
-from services.geodesy import move_metres
-from services.types import Array, Frame
+from amers.services.adjustment.control_ground import ControlGround
+from amers.services.adjustment.frame_fit import FrameFit, fit_frame
+from amers.services.errors import NoConsensus
+from amers.services.geodesy import move_metres
+from amers.services.types import Array, Frame
 
 pytestmark = pytest.mark.thorough
 

@@ -7,10 +7,10 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from services.adjustment.control_ground import ControlGround
-from services.adjustment.frame_fit import fit_frame
-from services.geodesy import move_metres
-from services.types import Array, Frame, IntArray
+from amers.services.adjustment.control_ground import ControlGround
+from amers.services.adjustment.frame_fit import fit_frame
+from amers.services.geodesy import move_metres
+from amers.services.types import Array, Frame, IntArray
 
 STAYS = 0.9999
 COUNT = 5

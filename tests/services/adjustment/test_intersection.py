@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.adjustment.intersection import intersect, residuals_and_derivatives
-from services.geodesy import move_metres
-from services.simulation.view import ViewGeometry
-from services.types import Observations
+from amers.services.adjustment.intersection import intersect, residuals_and_derivatives
+from amers.services.geodesy import move_metres
+from amers.services.simulation.view import ViewGeometry
+from amers.services.types import Observations
 from tests.services.simulated import ring_of_geometries
 from tests.services.ties import difference_m, make_ties, whitened_square
 

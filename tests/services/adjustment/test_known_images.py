@@ -7,16 +7,16 @@ from functools import cache
 import numpy as np
 import pytest
 
+from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
+from amers.services.adjustment.control_ground import NO_CONTROL, ControlGround
+from amers.services.adjustment.known_images import known_images, tie
+from amers.services.adjustment.parameters import ImageParameters, image_parameters
+from amers.services.errors import InputError
+from amers.services.geodesy import move_metres
+from amers.services.sensors.correction import CorrectedModel, ImageCorrection
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.types import Array, Frame, IntArray, Observations
 from benchmarks.block_coverage import SHIFT_PX, Case, draw, whitened_square
-from services.adjustment.bundle import BlockAdjustment, adjust_block
-from services.adjustment.control_ground import NO_CONTROL, ControlGround
-from services.adjustment.known_images import known_images, tie
-from services.adjustment.parameters import ImageParameters, image_parameters
-from services.errors import InputError
-from services.geodesy import move_metres
-from services.sensors.correction import CorrectedModel, ImageCorrection
-from services.sensors.displacement import DisplacementGrid
-from services.types import Array, Frame, IntArray, Observations
 from tests.services.conftest import SHAPE, FlatModel
 from tests.services.ties import difference_m
 

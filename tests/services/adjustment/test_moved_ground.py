@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from services.adjustment.image_correction import SceneAdjustment, adjust_scene
-from services.quality.accuracy import normalised_error
-from services.quality.normal_law import normal_ce90
-from services.sensors.correction import ImageCorrection
-from services.types import Array, BoolArray
+from amers.services.adjustment.image_correction import SceneAdjustment, adjust_scene
+from amers.services.quality.accuracy import normalised_error
+from amers.services.quality.normal_law import normal_ce90
+from amers.services.sensors.correction import ImageCorrection
+from amers.services.types import Array, BoolArray
 from tests.services.adjustment.test_displacement_components import (
     MOTIONS,
     SHAPE,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from services.adjustment.observation_noise import found_noise
+from amers.services.adjustment.observation_noise import found_noise
 from tests.services.simulated import ring_of_geometries
 from tests.services.ties import make_ties
 

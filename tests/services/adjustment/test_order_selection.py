@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from services.adjustment.affine_fit import ORDERS, AffineFit
-from services.adjustment.image_correction import AdjustmentOptions
-from services.adjustment.order_selection import choose_order
+from amers.services.adjustment.affine_fit import ORDERS, AffineFit
+from amers.services.adjustment.image_correction import AdjustmentOptions
+from amers.services.adjustment.order_selection import choose_order
 
 SIGMA_PX = 0.5
 COUNT = 60

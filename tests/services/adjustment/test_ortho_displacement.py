@@ -6,16 +6,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from services.adjustment.affine_fit import AffineFit
-from services.adjustment.control_observations import ControlObservations
-from services.adjustment.image_correction import SceneAdjustment, adjust_scene
-from services.adjustment.placed_measures import PlacedMeasures
-from services.map_grid import MapGrid
-from services.quality.accuracy import normalised_error
-from services.quality.normal_law import normal_ce90
-from services.sensors.correction import no_correction
-from services.sensors.ortho import OrthoModel
-from services.types import Array
+from amers.services.adjustment.affine_fit import AffineFit
+from amers.services.adjustment.control_observations import ControlObservations
+from amers.services.adjustment.image_correction import SceneAdjustment, adjust_scene
+from amers.services.adjustment.placed_measures import PlacedMeasures
+from amers.services.map_grid import MapGrid
+from amers.services.quality.accuracy import normalised_error
+from amers.services.quality.normal_law import normal_ce90
+from amers.services.sensors.correction import no_correction
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Array
 
 pytestmark = pytest.mark.thorough
 

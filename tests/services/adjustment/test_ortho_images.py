@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
+from amers.services.adjustment.control_ground import NO_CONTROL, ControlGround
+from amers.services.errors import InputError, NotEnoughPoints
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Array, BoolArray, Frame, Observations
 from benchmarks._cape_verde import ORTHO, SITES, STEREO, Draw, draw
-from services.adjustment.bundle import BlockAdjustment, adjust_block
-from services.adjustment.control_ground import NO_CONTROL, ControlGround
-from services.errors import InputError, NotEnoughPoints
-from services.sensors.ortho import OrthoModel
-from services.types import Array, BoolArray, Frame, Observations
 from tests.services.ties import difference_m
 
 TIES = 180

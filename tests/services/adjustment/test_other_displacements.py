@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from services.adjustment.affine_fit import FREE, AffineFit
-from services.adjustment.displacement_components import Component
-from services.adjustment.moved_ground import moved_ground
-from services.adjustment.placed_measures import PlacedMeasures
-from services.adjustment.scene_motion import SceneMotion
-from services.types import Array, BoolArray, IntArray
+from amers.services.adjustment.affine_fit import FREE, AffineFit
+from amers.services.adjustment.displacement_components import Component
+from amers.services.adjustment.moved_ground import moved_ground
+from amers.services.adjustment.placed_measures import PlacedMeasures
+from amers.services.adjustment.scene_motion import SceneMotion
+from amers.services.types import Array, BoolArray, IntArray
 
 SHAPE = (4000, 3000)
 COUNT = 90

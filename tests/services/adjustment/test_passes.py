@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from services.adjustment.block_accuracy import positive_part
-from services.adjustment.bundle import adjust_block
-from services.adjustment.parameters import block_priors, image_parameters, sharing_covariance
+from amers.services.adjustment.block_accuracy import positive_part
+from amers.services.adjustment.bundle import adjust_block
+from amers.services.adjustment.parameters import block_priors, image_parameters, sharing_covariance
 from tests.services.conftest import SHAPE, FlatModel
 from tests.services.simulated import ring_of_geometries
 from tests.services.ties import make_ties

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from services.adjustment.bundle import BlockAdjustment, adjust_block
-from services.adjustment.control_ground import ControlGround
-from services.adjustment.parameters import ImageParameters, image_parameters
-from services.formats.images.scenes import read_scene
-from services.geodesy import east_north_up, move_metres
-from services.imagery.scene import Scene, scene_gsd_m
-from services.imagery.source import Window
-from services.types import Array, Frame, Observations
+from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
+from amers.services.adjustment.control_ground import ControlGround
+from amers.services.adjustment.parameters import ImageParameters, image_parameters
+from amers.services.formats.images.scenes import read_scene
+from amers.services.geodesy import east_north_up, move_metres
+from amers.services.imagery.scene import Scene, scene_gsd_m
+from amers.services.imagery.source import Window
+from amers.services.types import Array, Frame, Observations
 from tests.journeys.ties import independent_tracks
 from tests.services.ties import difference_m
 

@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from services.adjustment.bundle import BlockAdjustment, adjust_block
-from services.adjustment.control_ground import NO_CONTROL, ControlGround
-from services.adjustment.parameters import ImageParameters, image_parameters
-from services.formats.sensor_models.dimap import parse_dimap_rpc
-from services.geodesy import move_metres
-from services.quality.accuracy import normalised_error
-from services.types import Array, Frame, Observations
+from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
+from amers.services.adjustment.control_ground import NO_CONTROL, ControlGround
+from amers.services.adjustment.parameters import ImageParameters, image_parameters
+from amers.services.formats.sensor_models.dimap import parse_dimap_rpc
+from amers.services.geodesy import move_metres
+from amers.services.quality.accuracy import normalised_error
+from amers.services.types import Array, Frame, Observations
 from tests.services.ties import difference_m
 
 pytestmark = pytest.mark.real_data

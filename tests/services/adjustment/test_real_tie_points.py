@@ -7,10 +7,10 @@ import pytest
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from services.adjustment.bundle import BlockAdjustment, adjust_block
-from services.adjustment.parameters import image_parameters
-from services.formats.sensor_models.rpc_text import parse_rpc_text
-from services.types import Array, Observations
+from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
+from amers.services.adjustment.parameters import image_parameters
+from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
+from amers.services.types import Array, Observations
 
 pytestmark = [pytest.mark.real_data, pytest.mark.thorough]
 

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.adjustment.bundle import adjust_block
-from services.adjustment.control_ground import ControlGround
-from services.adjustment.rigorous_parameters import rigorous_parameters
-from services.errors import InputError
-from services.formats.sensor_models.rigorous_model import read_rigorous_model
-from services.sensors.parameter_sets import PARAMETER_SETS
-from services.sensors.pushbroom import PushbroomModel
-from services.types import Frame, Observations
+from amers.services.adjustment.bundle import adjust_block
+from amers.services.adjustment.control_ground import ControlGround
+from amers.services.adjustment.rigorous_parameters import rigorous_parameters
+from amers.services.errors import InputError
+from amers.services.formats.sensor_models.rigorous_model import read_rigorous_model
+from amers.services.sensors.parameter_sets import PARAMETER_SETS
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.types import Frame, Observations
 
 pytestmark = pytest.mark.real_data
 

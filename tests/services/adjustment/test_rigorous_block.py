@@ -5,21 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from amers.services.adjustment.block_problem import BlockOptions
+from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
+from amers.services.adjustment.control_ground import NO_CONTROL, ControlGround
+from amers.services.adjustment.parameter_figures import held_parameters, parameter_figures
+from amers.services.adjustment.parameters import AdjustableImage, image_parameters, sharing_covariance
+from amers.services.adjustment.rigorous_parameters import rigorous_parameters
+from amers.services.errors import InputError
+from amers.services.geodesy import lon_lat_h_from_east_north_up
+from amers.services.sensors.parameter_sets import PARAMETER_SETS, SPOT_HRV, SRP, TOUTIN, ParameterSet
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.sensors.refined import refined_rpc
+from amers.services.sensors.rpc_fit import fit_rpc
+from amers.services.simulation.orbit import pushbroom_over
+from amers.services.types import Array, Frame, Observations
 from benchmarks._rigorous_block import EXACT, Truth, drawn
-from services.adjustment.block_problem import BlockOptions
-from services.adjustment.bundle import BlockAdjustment, adjust_block
-from services.adjustment.control_ground import NO_CONTROL, ControlGround
-from services.adjustment.parameter_figures import held_parameters, parameter_figures
-from services.adjustment.parameters import AdjustableImage, image_parameters, sharing_covariance
-from services.adjustment.rigorous_parameters import rigorous_parameters
-from services.errors import InputError
-from services.geodesy import lon_lat_h_from_east_north_up
-from services.sensors.parameter_sets import PARAMETER_SETS, SPOT_HRV, SRP, TOUTIN, ParameterSet
-from services.sensors.pushbroom import PushbroomModel
-from services.sensors.refined import refined_rpc
-from services.sensors.rpc_fit import fit_rpc
-from services.simulation.orbit import pushbroom_over
-from services.types import Array, Frame, Observations
 from tests.services.ties import difference_m
 
 TARGET = np.array([5.4, 43.6, 250.0])

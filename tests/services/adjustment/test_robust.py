@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from services.adjustment.robust import CAUCHY_TUNING, MAD_TO_STD, deactivate, likeliest_variance
-from services.adjustment.robust_kernel import reweighted_solution
-from services.types import Array, BoolArray
+from amers.services.adjustment.robust import CAUCHY_TUNING, MAD_TO_STD, deactivate, likeliest_variance
+from amers.services.adjustment.robust_kernel import reweighted_solution
+from amers.services.types import Array, BoolArray
 
 a_millipixel = 1e-3
 SHIFT_ONLY = np.array([[True, False], [True, False]])

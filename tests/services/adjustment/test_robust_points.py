@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from services.adjustment.normal_equations import Equations, RobustTerms, robust_points
-from services.types import Array
+from amers.services.adjustment.normal_equations import Equations, RobustTerms, robust_points
+from amers.services.types import Array
 
 a_hundredth = 0.01
 

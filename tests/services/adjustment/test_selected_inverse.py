@@ -5,8 +5,8 @@ import pytest
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from services.adjustment.normal_equations import seen_pairs
-from services.adjustment.selected_inverse import selected_inverse
+from amers.services.adjustment.normal_equations import seen_pairs
+from amers.services.adjustment.selected_inverse import selected_inverse
 
 IMAGES, SIZE = 60, 3
 

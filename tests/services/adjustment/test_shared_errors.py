@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from services.adjustment.affine_fit import FREE, AffineFit
-from services.adjustment.shared_errors import SharedErrors, likeliest_shared_errors
+from amers.services.adjustment.affine_fit import FREE, AffineFit
+from amers.services.adjustment.shared_errors import SharedErrors, likeliest_shared_errors
 
 LENGTHS = 0.05, 0.1, 0.2
 """Sides of the image, over which errors may be correlated."""

@@ -7,13 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.adjustment.control_observations import ControlObservations
-from services.adjustment.image_correction import SceneAdjustment, adjust_scene
-from services.adjustment.short_motion import MAX_CHANCE, STRIPS, ChipStrips, ShortMotion, short_motion
-from services.quality.accuracy import normalised_error
-from services.sensors.correction import no_correction
-from services.sensors.displacement import DisplacementGrid
-from services.types import Array
+from amers.services.adjustment.control_observations import ControlObservations
+from amers.services.adjustment.image_correction import SceneAdjustment, adjust_scene
+from amers.services.adjustment.short_motion import (
+    MAX_CHANCE,
+    STRIPS,
+    ChipStrips,
+    ShortMotion,
+    short_motion,
+)
+from amers.services.quality.accuracy import normalised_error
+from amers.services.sensors.correction import no_correction
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.types import Array
 from tests.services.conftest import GSD_M, FlatModel
 
 SHAPE = (4000, 3000)

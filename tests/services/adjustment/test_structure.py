@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import f as f_law
 
-from services.adjustment.structure import Family, Residuals, probability_of_structure, structures
-from services.types import Array
+from amers.services.adjustment.structure import Family, Residuals, probability_of_structure, structures
+from amers.services.types import Array
 
 SHAPE = (4000.0, 3000.0)
 COUNT = 45

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from services.adjustment.displacement_components import Component
-from services.adjustment.unseen_seams import unseen_seams
+from amers.services.adjustment.displacement_components import Component
+from amers.services.adjustment.unseen_seams import unseen_seams
 from tests.services.adjustment.test_displacement_components import (
     SHAPE,
     WRONG,

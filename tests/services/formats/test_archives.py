@@ -12,9 +12,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from services.errors import FormatError
-from services.formats import archives
-from services.formats.archives import (
+from amers.services.errors import FormatError
+from amers.services.formats import archives
+from amers.services.formats.archives import (
     HEAD_BYTES,
     ArchiveLimits,
     check_archive,

@@ -18,21 +18,21 @@ from pyproj import CRS
 from rasterio.transform import Affine, RPCTransformer
 from rasterio.warp import transform
 
-from services.formats.images.ortho import write_refined_ortho
-from services.formats.sensor_models.correction_json import (
+from amers.services.formats.images.ortho import write_refined_ortho
+from amers.services.formats.sensor_models.correction_json import (
     format_correction,
     parse_correction,
     parse_correction_accuracy,
 )
-from services.formats.sensor_models.dimap import format_dimap_rpc, parse_dimap_rpc
-from services.formats.sensor_models.rpc_text import parse_rpc_text
-from services.formats.vector.residual_layers import write_residual_layers
-from services.map_grid import MapGrid
-from services.reports.drawing import ACTIVE, DEACTIVATED, NOT_MATCHED
-from services.sensors.correction import CorrectedModel
-from services.sensors.ortho import OrthoModel
-from services.sensors.rpc import RpcModel
-from services.types import Frame, Measures
+from amers.services.formats.sensor_models.dimap import format_dimap_rpc, parse_dimap_rpc
+from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
+from amers.services.formats.vector.residual_layers import write_residual_layers
+from amers.services.map_grid import MapGrid
+from amers.services.reports.drawing import ACTIVE, DEACTIVATED, NOT_MATCHED
+from amers.services.sensors.correction import CorrectedModel
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Frame, Measures
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 

@@ -7,8 +7,8 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-from services.errors import FormatError
-from services.formats.ground_masks import any_of, read_ground_mask, read_land_cover
+from amers.services.errors import FormatError
+from amers.services.formats.ground_masks import any_of, read_ground_mask, read_land_cover
 
 PLACES = np.array([[5.005, 43.095], [5.055, 43.045], [5.095, 43.005], [6.0, 43.05]])
 """Of the first, the middle and the last of ten by ten pixels of 0.01 degree, and beside them."""

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from services.errors import FormatError
-from services.formats.vector.layers import read_layer
+from amers.services.errors import FormatError
+from amers.services.formats.vector.layers import read_layer
 
 POINT = {"type": "Point", "coordinates": [1.0, 2.0]}
 FEATURE = {"type": "Feature", "properties": {"secret": "yes"}, "geometry": POINT}

@@ -11,9 +11,9 @@ import pyogrio
 import pytest
 import shapely
 
-from services.errors import FormatError, InputError
-from services.formats.vector.layers import VectorLayer, read_layer, write_layer
-from services.formats.vector.pixel_coordinates import (
+from amers.services.errors import FormatError, InputError
+from amers.services.formats.vector.layers import VectorLayer, read_layer, write_layer
+from amers.services.formats.vector.pixel_coordinates import (
     PIXEL_ORIGINS,
     PixelOrigin,
     check_inside,

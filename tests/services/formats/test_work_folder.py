@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.errors import FormatError, InputError
-from services.formats.work_folder import WorkFolder
+from amers.services.errors import FormatError, InputError
+from amers.services.formats.work_folder import WorkFolder
 
 INPUTS = {"images": ["a.tif", "b.tif"], "version": "1"}
 

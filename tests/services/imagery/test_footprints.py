@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
-from services.imagery.footprints import footprint_on_ground
+from amers.services.imagery.footprints import footprint_on_ground
 
 
 def has(shape, lon, lat):

@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from services.imagery.gaps import bridged, filled, lost_pixels
-from services.imagery.resampling import resample, spline_coefficients
-from services.imagery.source import ArrayImage, block_means, low_pass, sample_image
-from services.types import FloatImage
+from amers.services.imagery.gaps import bridged, filled, lost_pixels
+from amers.services.imagery.resampling import resample, spline_coefficients
+from amers.services.imagery.source import ArrayImage, block_means, low_pass, sample_image
+from amers.services.types import FloatImage
 
 a_tenth_of_the_contrast = 0.1
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import shapely
 
-from services.imagery.hidden import OutlinedImage, without_hidden_ground
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, Window
-from services.types import Acquisition
+from amers.services.imagery.hidden import OutlinedImage, without_hidden_ground
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, Window
+from amers.services.types import Acquisition
 from tests.factories import affine_model
 from tests.services.production.test_image_pairs import SIDE, strip
 

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from services.formats.images.scenes import read_scene
-from services.imagery.line_breaks import line_breaks
-from services.imagery.source import ArrayImage, Window
-from services.types import FloatImage
+from amers.services.formats.images.scenes import read_scene
+from amers.services.imagery.line_breaks import line_breaks
+from amers.services.imagery.source import ArrayImage, Window
+from amers.services.types import FloatImage
 
 LINES, SAMPLES = 900, 700
 REAL_VIEWS = (

@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 from shapely.geometry import MultiPoint, Polygon
 
-from services.imagery.scene import Scene, scene_centre, scene_footprint, scene_gsd_m, view_direction
-from services.imagery.source import ArrayImage
-from services.simulation.view import ViewGeometry, plan_geometry
-from services.simulation.world import World, make_world
-from services.types import Array
+from amers.services.imagery.scene import (
+    Scene,
+    scene_centre,
+    scene_footprint,
+    scene_gsd_m,
+    view_direction,
+)
+from amers.services.imagery.source import ArrayImage
+from amers.services.simulation.view import ViewGeometry, plan_geometry
+from amers.services.simulation.world import World, make_world
+from amers.services.types import Array
 from tests.services.simulated import plan, world
 
 a_metre_deg = 1.0 / 111_000.0

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from services.geodesy import east_north_up, lon_lat_h_from_east_north_up
-from services.imagery.gaps import filled
-from services.imagery.source import (
+from amers.services.geodesy import east_north_up, lon_lat_h_from_east_north_up
+from amers.services.imagery.gaps import filled
+from amers.services.imagery.source import (
     ArrayImage,
     CachedImage,
     Window,
@@ -18,9 +18,9 @@ from services.imagery.source import (
     reduce_image,
     render_chip,
 )
-from services.map_grid import MapGrid
-from services.sensors.ortho import OrthoModel
-from services.types import Array, FloatImage
+from amers.services.map_grid import MapGrid
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Array, FloatImage
 
 a_millimetre = 1e-3
 half_a_percent_of_the_amplitude = 0.005

@@ -6,6 +6,27 @@ from functools import cache
 import numpy as np
 import pytest
 
+from amers.services.geodesy import move_metres
+from amers.services.imagery.scene import scene_gsd_m
+from amers.services.joint.block import JointBlock, adjust_together, repeated
+from amers.services.joint.fitting import SceneFit, adjust_fitting, ties_between
+from amers.services.joint.measured import MeasuredScene, nothing_found, options_in_block
+from amers.services.joint.registration import qualified
+from amers.services.joint.results import (
+    held_cells,
+    held_draws,
+    registered_scene,
+    scene_adjustment,
+    scene_measures,
+)
+from amers.services.map_grid import MapGrid
+from amers.services.quality.frames import frame_in_image
+from amers.services.quality.stability import image_places
+from amers.services.registration.options import RegistrationOptions
+from amers.services.sensors.correction import no_correction
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.simulation.world import World, make_world
+from amers.services.types import Array, Frame, Observations
 from benchmarks._joint_scenes import (
     ImagePlan,
     JointTruth,
@@ -17,27 +38,6 @@ from benchmarks._joint_scenes import (
     places,
     tie_points,
 )
-from services.geodesy import move_metres
-from services.imagery.scene import scene_gsd_m
-from services.joint.block import JointBlock, adjust_together, repeated
-from services.joint.fitting import SceneFit, adjust_fitting, ties_between
-from services.joint.measured import MeasuredScene, nothing_found, options_in_block
-from services.joint.registration import qualified
-from services.joint.results import (
-    held_cells,
-    held_draws,
-    registered_scene,
-    scene_adjustment,
-    scene_measures,
-)
-from services.map_grid import MapGrid
-from services.quality.frames import frame_in_image
-from services.quality.stability import image_places
-from services.registration.options import RegistrationOptions
-from services.sensors.correction import no_correction
-from services.sensors.ortho import OrthoModel
-from services.simulation.world import World, make_world
-from services.types import Array, Frame, Observations
 
 OPTIONS = RegistrationOptions()
 SHAPE, GSD_M = (8000, 8000), 0.5

@@ -6,12 +6,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.joint.block import JointBlock, adjust_together
-from services.joint.measured import MeasuredScene
-from services.joint.results import ground_misfits_m, tie_residual_px
-from services.quality.stability import image_places
-from services.sensors.displacement import DisplacementGrid
-from services.types import Frame, Observations
+from amers.services.joint.block import JointBlock, adjust_together
+from amers.services.joint.measured import MeasuredScene
+from amers.services.joint.results import ground_misfits_m, tie_residual_px
+from amers.services.quality.stability import image_places
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.types import Frame, Observations
 from tests.services.joint.test_joint_block import FRAME, GSD_M, OPTIONS, SHAPE, observed, truth_of
 
 TIE_NOISE_PX = 0.2

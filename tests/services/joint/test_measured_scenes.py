@@ -5,10 +5,10 @@ from functools import cache
 
 import numpy as np
 
-from services.imagery.scene import scene_gsd_m
-from services.joint.measured import MeasuredScene
-from services.sensors.displacement import DisplacementGrid
-from services.types import Array
+from amers.services.imagery.scene import scene_gsd_m
+from amers.services.joint.measured import MeasuredScene
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.types import Array
 from tests.services.joint.test_joint_block import SHAPE, observed, truth_of
 
 PERIOD_PX = 300.0

@@ -7,6 +7,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from amers.services.adjustment.parameters import image_parameters
+from amers.services.adjustment.rigorous_parameters import rigorous_parameters
+from amers.services.formats.sensor_models.rigorous_model import read_rigorous_model
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.joint.block import JointBlock
+from amers.services.joint.fitting import adjust_fitting
+from amers.services.joint.results import rigorous_scene, scene_adjustment
+from amers.services.quality.stability import image_places
+from amers.services.registration.options import RegistrationOptions
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.correction import ImageCorrection
+from amers.services.sensors.parameter_sets import SRP, ParameterSet
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.sensors.refined import refined_rpc
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Acquisition, Array, Frame
 from benchmarks import _rigorous_oracles as oracles
 from benchmarks._joint_scenes import (
     ImagePlan,
@@ -18,23 +35,6 @@ from benchmarks._joint_scenes import (
     places,
     tie_points,
 )
-from services.adjustment.parameters import image_parameters
-from services.adjustment.rigorous_parameters import rigorous_parameters
-from services.formats.sensor_models.rigorous_model import read_rigorous_model
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.joint.block import JointBlock
-from services.joint.fitting import adjust_fitting
-from services.joint.results import rigorous_scene, scene_adjustment
-from services.quality.stability import image_places
-from services.registration.options import RegistrationOptions
-from services.sensors.base import SensorModel
-from services.sensors.correction import ImageCorrection
-from services.sensors.parameter_sets import SRP, ParameterSet
-from services.sensors.pushbroom import PushbroomModel
-from services.sensors.refined import refined_rpc
-from services.sensors.rpc import RpcModel
-from services.types import Acquisition, Array, Frame
 
 pytestmark = pytest.mark.real_data
 

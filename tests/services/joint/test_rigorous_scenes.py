@@ -6,6 +6,26 @@ from functools import cache
 import numpy as np
 import pytest
 
+from amers.services.adjustment.rigorous_parameters import RigorousParameters, rigorous_parameters
+from amers.services.errors import InputError
+from amers.services.imagery.scene import Scene
+from amers.services.joint.block import JointBlock, adjust_together
+from amers.services.joint.fitting import adjust_fitting, ties_between
+from amers.services.joint.measured import MeasuredScene, nothing_found
+from amers.services.joint.nearest import nearest_correction, scene_heights_m
+from amers.services.joint.registration import qualified
+from amers.services.joint.results import rigorous_scene, scene_adjustment
+from amers.services.map_grid import MapGrid
+from amers.services.quality.stability import image_places
+from amers.services.registration.options import RegistrationOptions
+from amers.services.sensors.correction import CorrectedModel, no_correction
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.sensors.parameter_sets import SRP, TOUTIN, ParameterSet
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.sensors.refined import refined_rpc
+from amers.services.sensors.rpc_fit import fit_rpc
+from amers.services.simulation.world import World, make_world
+from amers.services.types import Array, Frame, Observations
 from benchmarks._joint_scenes import (
     ImagePlan,
     JointTruth,
@@ -17,26 +37,6 @@ from benchmarks._joint_scenes import (
     places,
     tie_points,
 )
-from services.adjustment.rigorous_parameters import RigorousParameters, rigorous_parameters
-from services.errors import InputError
-from services.imagery.scene import Scene
-from services.joint.block import JointBlock, adjust_together
-from services.joint.fitting import adjust_fitting, ties_between
-from services.joint.measured import MeasuredScene, nothing_found
-from services.joint.nearest import nearest_correction, scene_heights_m
-from services.joint.registration import qualified
-from services.joint.results import rigorous_scene, scene_adjustment
-from services.map_grid import MapGrid
-from services.quality.stability import image_places
-from services.registration.options import RegistrationOptions
-from services.sensors.correction import CorrectedModel, no_correction
-from services.sensors.ortho import OrthoModel
-from services.sensors.parameter_sets import SRP, TOUTIN, ParameterSet
-from services.sensors.pushbroom import PushbroomModel
-from services.sensors.refined import refined_rpc
-from services.sensors.rpc_fit import fit_rpc
-from services.simulation.world import World, make_world
-from services.types import Array, Frame, Observations
 
 pytestmark = pytest.mark.thorough
 

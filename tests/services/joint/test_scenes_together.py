@@ -6,14 +6,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.joint.registration import JointRegistration, register_together
-from services.quality.normal_law import normal_ce90
-from services.registration.on_points import register_scene
-from services.simulation.distortion import DistortedImage, Distortion, Waves
-from services.simulation.view import SimulatedView, simulate_view
-from services.types import Array
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.joint.registration import JointRegistration, register_together
+from amers.services.quality.normal_law import normal_ce90
+from amers.services.registration.on_points import register_scene
+from amers.services.simulation.distortion import DistortedImage, Distortion, Waves
+from amers.services.simulation.view import SimulatedView, simulate_view
+from amers.services.types import Array
 from tests.services.registration.test_on_points import SIGMA_M, frame_m, per_degree
 from tests.services.simulated import block, plan, spoiled_view, world
 

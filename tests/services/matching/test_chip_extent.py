@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from services.matching.chip_extent import MAX_OFF_CENTRE_PX, central_square, visible_half_side
-from services.matching.correlate import FOUND, CorrelationOptions, find_chip
-from services.types import FloatImage
+from amers.services.matching.chip_extent import MAX_OFF_CENTRE_PX, central_square, visible_half_side
+from amers.services.matching.correlate import FOUND, CorrelationOptions, find_chip
+from amers.services.types import FloatImage
 from tests.services.textures import as_pixels, moved, texture
 
 pytestmark = pytest.mark.long

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from services.conventions import CHIP_SIZE
-from services.matching.chip_shears import ChipShears, chip_shears
-from services.matching.correlate import CorrelationOptions, Peak, find_chip
-from services.types import Array
+from amers.services.conventions import CHIP_SIZE
+from amers.services.matching.chip_shears import ChipShears, chip_shears
+from amers.services.matching.correlate import CorrelationOptions, Peak, find_chip
+from amers.services.types import Array
 
 RADIUS = 6
 SIDE = CHIP_SIZE + 2 * RADIUS

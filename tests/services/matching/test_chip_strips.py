@@ -4,12 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
-from services.adjustment.short_motion import STRIPS, ChipStrips
-from services.conventions import CHIP_SIZE
-from services.matching.chip_strips import chip_strips
-from services.matching.correlate import CorrelationOptions, find_chip
-from services.matching.view_combination import combine_views, no_measure
-from services.types import Array, FloatImage
+from amers.services.adjustment.short_motion import STRIPS, ChipStrips
+from amers.services.conventions import CHIP_SIZE
+from amers.services.matching.chip_strips import chip_strips
+from amers.services.matching.correlate import CorrelationOptions, find_chip
+from amers.services.matching.view_combination import combine_views, no_measure
+from amers.services.types import Array, FloatImage
 
 RADIUS = 6
 SIDE = CHIP_SIZE + 2 * RADIUS

@@ -4,14 +4,14 @@ import cv2
 import numpy as np
 import pytest
 
-from services.matching.consensus import (
+from amers.services.matching.consensus import (
     Consensus,
     Voters,
     a_contrario_consensus,
     affine_inliers,
     robust_affine_inliers,
 )
-from services.types import Array, FloatImage
+from amers.services.types import Array, FloatImage
 
 REACH_M = 60.0
 TOLERANCE_M = 3.0

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip
-from services.types import Array, FloatImage
+from amers.services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip
+from amers.services.types import Array, FloatImage
 from tests.services.textures import as_pixels, moved, texture
 
 a_twentieth_of_a_pixel = 0.05

@@ -6,11 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.imagery.scene import Scene, scene_gsd_m
-from services.imagery.source import ArrayImage
-from services.matching.ground_features import FeatureOptions, Features, find_features
-from services.matching.tie_points import match_features
-from services.simulation.view import SimulatedView, ViewPlan, simulate_view
+from amers.services.imagery.scene import Scene, scene_gsd_m
+from amers.services.imagery.source import ArrayImage
+from amers.services.matching.ground_features import FeatureOptions, Features, find_features
+from amers.services.matching.tie_points import match_features
+from amers.services.simulation.view import SimulatedView, ViewPlan, simulate_view
 from tests.services.simulated import BLOCK_SIGMA_M, block_views, world
 
 COARSE_GSD_M = 1.6
@@ -109,7 +109,7 @@ def test_memory_is_that_of_a_part_and_parts_leave_no_gap() -> None:
     options = FeatureOptions(per_image=50_000, per_megapixel=50_000)
     whole = find_features(scene, gsd_m, options)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("services.matching.ground_features._LARGEST_PX", 260)
+        patch.setattr("amers.services.matching.ground_features._LARGEST_PX", 260)
         parts = find_features(scene, gsd_m, options)
     cells = np.arange(0, 701, 70)
     count, of_parts = (

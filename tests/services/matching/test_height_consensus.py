@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from services.matching.height_consensus import height_consensus, view_consensus
+from amers.services.matching.height_consensus import height_consensus, view_consensus
 
 TOLERANCE_PX = 1.0
 REACH_PX = np.full(100, 50.0)

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from services.imagery.resampling import resample, spline_coefficients
-from services.matching.least_squares import Fit, covariance_from_influence, fit_chip
-from services.matching.least_squares_kernels import (
+from amers.services.imagery.resampling import resample, spline_coefficients
+from amers.services.matching.least_squares import Fit, covariance_from_influence, fit_chip
+from amers.services.matching.least_squares_kernels import (
     CELL_PX,
     REACH_PX,
     add_bartlett_sums,
     neighbour_correlation,
 )
-from services.types import Array, FloatImage
+from amers.services.types import Array, FloatImage
 from tests.services.textures import as_pixels, moved, texture
 
 SIDE, MARGIN, PERIOD = 34, 15, 64

@@ -7,14 +7,14 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from services.imagery.gaps import missing_reason
-from services.matching.correlate import (
+from amers.services.imagery.gaps import missing_reason
+from amers.services.matching.correlate import (
     FOUND,
     CorrelationOptions,
     correlation_map,
     find_chip,
 )
-from services.types import Array, BoolArray, FloatImage
+from amers.services.types import Array, BoolArray, FloatImage
 from tests.services.textures import as_pixels, moved, texture
 
 OPTIONS = CorrelationOptions()

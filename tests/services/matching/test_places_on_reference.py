@@ -5,20 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.errors import InputError
-from services.imagery.resampling import resample, spline_coefficients
-from services.imagery.source import ArrayImage, reduce_image
-from services.map_grid import MapGrid
-from services.matching.correlate import FOUND
-from services.matching.reference_image import (
+from amers.services.errors import InputError
+from amers.services.imagery.resampling import resample, spline_coefficients
+from amers.services.imagery.source import ArrayImage, reduce_image
+from amers.services.map_grid import MapGrid
+from amers.services.matching.correlate import FOUND
+from amers.services.matching.reference_image import (
     Reference,
     ReferenceMatchingOptions,
     locate_on_terrain,
     match_places,
     visible_places,
 )
-from services.sensors.ortho import OrthoModel
-from services.simulation.orbit import pushbroom_over
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.simulation.orbit import pushbroom_over
 from tests.services.production.displaced_details import GSD_M, Details
 from tests.services.textures import as_pixels, moved, texture
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.conventions import CHIP_SIZE
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, Window
-from services.matching.multi_image import (
+from amers.services.conventions import CHIP_SIZE
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, Window
+from amers.services.matching.multi_image import (
     RefinementOptions,
     chip_inside,
     chip_saliency,
@@ -17,7 +17,7 @@ from services.matching.multi_image import (
     refine_on_chips,
     seen_whole,
 )
-from services.types import Array, FloatImage
+from amers.services.types import Array, FloatImage
 from tests.services.registration.small_ground import GSD_M, scene, whole
 from tests.services.textures import as_pixels, texture
 

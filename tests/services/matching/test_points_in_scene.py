@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, Window
-from services.matching.control_points import (
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, Window
+from amers.services.matching.control_points import (
     ChipSearch,
     MatchingOptions,
     PointMatches,
     match_points,
     with_matches,
 )
-from services.matching.correlate import FOUND
-from services.sensors.ortho import OrthoModel
-from services.types import Array, ChipArray, ControlPoints, Views
+from amers.services.matching.correlate import FOUND
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Array, ChipArray, ControlPoints, Views
 from tests.services.registration.small_ground import GSD_M, points_at, scene
 from tests.services.simulated import MemoryChips
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from services.matching.predict import in_image, spread_over_image
+from amers.services.matching.predict import in_image, spread_over_image
 
 SHAPE = (1000, 2000)
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from services.matching.correlate import FOUND, CorrelationOptions, find_chip
-from services.matching.radiometry import cloud_mask, gradient_image, patch_statistics
-from services.types import Array, FloatImage
+from amers.services.matching.correlate import FOUND, CorrelationOptions, find_chip
+from amers.services.matching.radiometry import cloud_mask, gradient_image, patch_statistics
+from amers.services.types import Array, FloatImage
 from tests.services.textures import as_pixels, moved, texture
 
 a_tenth_of_a_pixel = 0.1

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from services.matching.correlate import FOUND, CorrelationOptions, find_chip
-from services.matching.shadows import (
+from amers.services.matching.correlate import FOUND, CorrelationOptions, find_chip
+from amers.services.matching.shadows import (
     CASTER_M,
     ShadowShift,
     shadow_shift,
     shadow_vector,
     shadow_weights,
 )
-from services.types import Acquisition, Array, FloatImage
+from amers.services.types import Acquisition, Array, FloatImage
 from tests.services.textures import texture
 
 pytestmark = pytest.mark.long

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.matching.surface_heights import surface_height
-from services.types import Acquisition, Array
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.matching.surface_heights import surface_height
+from amers.services.types import Acquisition, Array
 from tests.services.conftest import GSD_M, METRE_DEG, FlatModel
 from tests.services.textures import as_pixels, texture
 

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.matching.systematic_error import (
+from amers.services.matching.systematic_error import (
     COMMON_SIGMA_PX,
     HEIGHT_SIGMA_PX,
     IMAGE_SIGMA_PX,
     SHADOW_SIGMA_PX,
     common_covariance_px2,
 )
-from services.types import Acquisition, Array, BoolArray, Views
+from amers.services.types import Acquisition, Array, BoolArray, Views
 
 pytestmark = pytest.mark.thorough
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from services.matching.tie_points import Matches
-from services.matching.tracks import image_cells, spread_tracks, tracks
+from amers.services.matching.tie_points import Matches
+from amers.services.matching.tracks import image_cells, spread_tracks, tracks
 
 
 def links_of(

@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.matching.correlate import FOUND, Peak, rejected, sigma_per_coordinate
-from services.matching.least_squares import covariance_from_influence
-from services.matching.view_combination import (
+from amers.services.matching.correlate import FOUND, Peak, rejected, sigma_per_coordinate
+from amers.services.matching.least_squares import covariance_from_influence
+from amers.services.matching.view_combination import (
     ViewCombination,
     combine_views,
     combined_sigmas_px,
     no_measure,
 )
-from services.types import Array, IntArray
+from amers.services.types import Array, IntArray
 
 CELLS = 25
 AGREEMENT_PX = 0.7

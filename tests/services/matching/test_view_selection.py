@@ -6,8 +6,8 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from services.matching.view_selection import ViewDistanceScales, select_views, view_distances
-from services.types import UNKNOWN_FRAME, Acquisition, ControlPoints, IntArray, Views
+from amers.services.matching.view_selection import ViewDistanceScales, select_views, view_distances
+from amers.services.types import UNKNOWN_FRAME, Acquisition, ControlPoints, IntArray, Views
 
 SCENE = Acquisition(
     "scene",

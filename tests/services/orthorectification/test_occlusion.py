@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from services.imagery.source import ArrayImage, Window
-from services.map_grid import MapGrid
-from services.orthorectification.mapping import map_into_image, occluded_ground
-from services.terrain import Terrain
-from services.types import Array
+from amers.services.imagery.source import ArrayImage, Window
+from amers.services.map_grid import MapGrid
+from amers.services.orthorectification.mapping import map_into_image, occluded_ground
+from amers.services.terrain import Terrain
+from amers.services.types import Array
 from tests.services.conftest import METRE_DEG, FlatModel
 
 SIDE, POSTING_M = 90, 3.0

@@ -8,27 +8,27 @@ import numpy as np
 import pytest
 import rasterio
 
-from services.errors import ComputationError, CoverageError
-from services.formats.images.ortho import write_cog
-from services.geodesy import metres_per_degree_at
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.lines_of_sight import intersect_terrain
-from services.map_grid import MapGrid
-from services.orthorectification import rectify as module
-from services.orthorectification.mapping import map_into_image, occluded_ground
-from services.orthorectification.point_terrain import terrain_of_points
-from services.orthorectification.rectify import (
+from amers.services.errors import ComputationError, CoverageError
+from amers.services.formats.images.ortho import write_cog
+from amers.services.geodesy import metres_per_degree_at
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.lines_of_sight import intersect_terrain
+from amers.services.map_grid import MapGrid
+from amers.services.orthorectification import rectify as module
+from amers.services.orthorectification.mapping import map_into_image, occluded_ground
+from amers.services.orthorectification.point_terrain import terrain_of_points
+from amers.services.orthorectification.rectify import (
     OrthoOptions,
     OrthoWindow,
     Window,
     choose_grid,
     orthorectify,
 )
-from services.sensors.rpc_fit import fit_rpc
-from services.simulation.orbit import pushbroom_over
-from services.terrain import Terrain
-from services.types import Acquisition, Array, FloatImage
+from amers.services.sensors.rpc_fit import fit_rpc
+from amers.services.simulation.orbit import pushbroom_over
+from amers.services.terrain import Terrain
+from amers.services.types import Acquisition, Array, FloatImage
 from tests.factories import affine_model
 from tests.services.conftest import METRE_DEG, FlatModel
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.errors import CoverageError, InputError
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.orthorectification.point_terrain import terrain_of_points
-from services.orthorectification.tile_limits import TILE_PX, TilePlace, choose_tiles
-from services.sensors.rpc import RpcModel
-from services.types import Acquisition, Array
+from amers.services.errors import CoverageError, InputError
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.orthorectification.point_terrain import terrain_of_points
+from amers.services.orthorectification.tile_limits import TILE_PX, TilePlace, choose_tiles
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Acquisition, Array
 
 SHAPE = (3000, 2000)
 a_millionth_deg = 1e-6

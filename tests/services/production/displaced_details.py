@@ -5,12 +5,12 @@ from functools import cache
 
 import numpy as np
 
-from services.geodesy import move_metres
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.map_grid import MapGrid
-from services.sensors.ortho import OrthoModel
-from services.types import Acquisition, Array
+from amers.services.geodesy import move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.map_grid import MapGrid
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Acquisition, Array
 from tests.services.textures import as_pixels, moved, texture
 
 TILE_PX = 128

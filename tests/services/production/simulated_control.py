@@ -4,13 +4,13 @@ from functools import cache
 
 import numpy as np
 
-from services.adjustment.intersection import intersect
-from services.imagery.scene import Scene
-from services.production.control import Control
-from services.production.from_images import Production, produce_points
-from services.simulation.view import SimulatedView, simulate_block
-from services.tasks import Work
-from services.types import Array, Observations
+from amers.services.adjustment.intersection import intersect
+from amers.services.imagery.scene import Scene
+from amers.services.production.control import Control
+from amers.services.production.from_images import Production, produce_points
+from amers.services.simulation.view import SimulatedView, simulate_block
+from amers.services.tasks import Work
+from amers.services.types import Array, Observations
 from tests.services.simulated import GSD_M, OPTIONS, SHAPE, world
 from tests.services.ties import difference_m
 

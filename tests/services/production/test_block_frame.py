@@ -7,14 +7,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.adjustment.bundle import BlockAdjustment, adjust_block
-from services.adjustment.parameters import image_parameters
-from services.geodesy import move_metres
-from services.production.image_passes import image_passes
-from services.sensors.base import SensorModel
-from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
-from services.simulation.view import ViewGeometry
-from services.types import Acquisition, Array, Observations
+from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
+from amers.services.adjustment.parameters import image_parameters
+from amers.services.geodesy import move_metres
+from amers.services.production.image_passes import image_passes
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
+from amers.services.simulation.view import ViewGeometry
+from amers.services.types import Acquisition, Array, Observations
 from tests.services.simulated import GSD_M, ring_of_geometries, world
 from tests.services.ties import difference_m
 

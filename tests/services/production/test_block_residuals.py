@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.adjustment.bundle import BlockAdjustment, adjust_block
-from services.adjustment.parameters import image_parameters
-from services.geodesy import metres_per_degree
-from services.imagery.scene import Scene, scene_gsd_m
-from services.imagery.source import ArrayImage
-from services.production.block_residuals import FITS, ImageFit, image_fits, point_fits
-from services.types import Array, Observations
+from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
+from amers.services.adjustment.parameters import image_parameters
+from amers.services.geodesy import metres_per_degree
+from amers.services.imagery.scene import Scene, scene_gsd_m
+from amers.services.imagery.source import ArrayImage
+from amers.services.production.block_residuals import FITS, ImageFit, image_fits, point_fits
+from amers.services.types import Array, Observations
 from tests.services.production.displaced_details import drawn_details, map_moved
 from tests.services.simulated import block_views, world
 

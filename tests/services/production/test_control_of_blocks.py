@@ -6,16 +6,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.adjustment.control_ground import ControlGround
-from services.errors import NotEnoughPoints
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, render_chip
-from services.matching.multi_image import stored_chip
-from services.production.control import Control, MeasuredPoints, with_control
-from services.production.control_points import ControlBlock, find_control
-from services.production.marked_control import MarkedGround
-from services.tasks import Work
-from services.types import Array, ControlPoints, Frame, Observations, Views, no_progress
+from amers.services.adjustment.control_ground import ControlGround
+from amers.services.errors import NotEnoughPoints
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, render_chip
+from amers.services.matching.multi_image import stored_chip
+from amers.services.production.control import Control, MeasuredPoints, with_control
+from amers.services.production.control_points import ControlBlock, find_control
+from amers.services.production.marked_control import MarkedGround
+from amers.services.tasks import Work
+from amers.services.types import Array, ControlPoints, Frame, Observations, Views, no_progress
 from tests.services.production.displaced_details import (
     GSD_M,
     drawn_details,

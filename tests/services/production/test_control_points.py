@@ -6,12 +6,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.errors import NotEnoughPoints
-from services.geodesy import east_north_up, move_metres
-from services.production.control import Control
-from services.production.control_points import ControlBlock
-from services.production.from_images import Production, produce_points
-from services.types import Array, ControlPoints, Frame
+from amers.services.errors import NotEnoughPoints
+from amers.services.geodesy import east_north_up, move_metres
+from amers.services.production.control import Control
+from amers.services.production.control_points import ControlBlock
+from amers.services.production.from_images import Production, produce_points
+from amers.services.types import Array, ControlPoints, Frame
 from tests.services.production.simulated_control import frame_error_m, free, placed, views
 from tests.services.simulated import OPTIONS, MemoryChips
 

@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.errors import NotEnoughPoints
-from services.geodesy import move_metres
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, image_gsd_m, low_pass, render_chip
-from services.map_grid import MapGrid, lon_lat_of_xy, xy_of_lon_lat
-from services.matching.correlate import FOUND, CorrelationOptions, find_chip
-from services.production.from_chips import NO_CHIP, NOT_SHOWN, OwnChips, produce_points_with_chips
-from services.production.from_points import MISSING, NO_HEIGHT, NOT_SALIENT, SAME_PLACE
-from services.sensors.ortho import OrthoModel
-from services.types import Acquisition, Array, Frame, GroundPoints
+from amers.services.errors import NotEnoughPoints
+from amers.services.geodesy import move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, image_gsd_m, low_pass, render_chip
+from amers.services.map_grid import MapGrid, lon_lat_of_xy, xy_of_lon_lat
+from amers.services.matching.correlate import FOUND, CorrelationOptions, find_chip
+from amers.services.production.from_chips import NO_CHIP, NOT_SHOWN, OwnChips, produce_points_with_chips
+from amers.services.production.from_points import MISSING, NO_HEIGHT, NOT_SALIENT, SAME_PLACE
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Acquisition, Array, Frame, GroundPoints
 from tests.services.chip_bases import CORNER_XY, UTM, image, north_up
 from tests.services.textures import as_pixels, texture
 

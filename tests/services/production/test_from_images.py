@@ -5,16 +5,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from services.adjustment.intersection import Intersection, intersect
-from services.conventions import CHIP_CENTRE, CHIP_SIZE
-from services.errors import ComputationError, InputError, NotEnoughPoints
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, render_chip
-from services.matching.multi_image import stored_chip
-from services.production.from_images import Production, ProductionOptions, produce_points
-from services.simulation.view import plan_geometry
-from services.tasks import Work
-from services.types import Array, BoolArray, Observations
+from amers.services.adjustment.intersection import Intersection, intersect
+from amers.services.conventions import CHIP_CENTRE, CHIP_SIZE
+from amers.services.errors import ComputationError, InputError, NotEnoughPoints
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, render_chip
+from amers.services.matching.multi_image import stored_chip
+from amers.services.production.from_images import Production, ProductionOptions, produce_points
+from amers.services.simulation.view import plan_geometry
+from amers.services.tasks import Work
+from amers.services.types import Array, BoolArray, Observations
 from tests.services.simulated import (
     BLOCK_SIGMA_M,
     OPTIONS,

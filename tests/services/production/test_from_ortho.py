@@ -6,22 +6,22 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.conventions import CHIP_SIZE
-from services.errors import InputError, NotEnoughPoints
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, render_chip
-from services.map_grid import MapGrid
-from services.matching.multi_image import chip_inside
-from services.production.from_ortho import (
+from amers.services.conventions import CHIP_SIZE
+from amers.services.errors import InputError, NotEnoughPoints
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, render_chip
+from amers.services.map_grid import MapGrid
+from amers.services.matching.multi_image import chip_inside
+from amers.services.production.from_ortho import (
     GroundHeights,
     OrthoPointOptions,
     OrthoPoints,
     produce_ortho_points,
 )
-from services.registration.on_points import register_scene
-from services.sensors.ortho import OrthoModel
-from services.terrain import Terrain
-from services.types import Acquisition, Array
+from amers.services.registration.on_points import register_scene
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.terrain import Terrain
+from amers.services.types import Acquisition, Array
 from tests.services.simulated import MemoryChips, block_views
 from tests.services.textures import as_pixels, moved, texture
 

@@ -6,10 +6,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.errors import InputError, NotEnoughPoints
-from services.geodesy import east_north_up, move_metres
-from services.imagery.scene import Scene
-from services.production.from_points import (
+from amers.services.errors import InputError, NotEnoughPoints
+from amers.services.geodesy import east_north_up, move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.production.from_points import (
     MISSING,
     NO_HEIGHT,
     NOT_CONFIRMED,
@@ -20,9 +20,9 @@ from services.production.from_points import (
     KnownPoints,
     produce_known_points,
 )
-from services.registration.on_points import register_scene
-from services.simulation.view import SimulatedView, simulate_view, true_ground
-from services.types import UNKNOWN_FRAME, Array, Frame, GroundPoints
+from amers.services.registration.on_points import register_scene
+from amers.services.simulation.view import SimulatedView, simulate_view, true_ground
+from amers.services.types import UNKNOWN_FRAME, Array, Frame, GroundPoints
 from tests.services.production.test_from_ortho import GSD_M, SIDE, land, ortho
 from tests.services.production.test_several_orthos import LOCAL_PX, date, errors_m, named
 from tests.services.simulated import SHAPE, MemoryChips, plan, world

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import shapely
 
-from services.imagery.footprints import footprint_on_ground
-from services.production.ground_cells import ground_grid, seen_cells
+from amers.services.imagery.footprints import footprint_on_ground
+from amers.services.production.ground_cells import ground_grid, seen_cells
 
 EARTH_KM2 = 510_065_621.7
 """Area of the WGS 84 ellipsoid."""

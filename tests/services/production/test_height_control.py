@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.errors import NotEnoughPoints
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.map_grid import MapGrid
-from services.production.height_control import ControlHeights, known_heights, ortho_heights
-from services.sensors.ortho import OrthoModel
-from services.terrain import Terrain
-from services.types import Acquisition, Array, Frame, Observations, SurfaceHeights
+from amers.services.errors import NotEnoughPoints
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.map_grid import MapGrid
+from amers.services.production.height_control import ControlHeights, known_heights, ortho_heights
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.terrain import Terrain
+from amers.services.types import Acquisition, Array, Frame, Observations, SurfaceHeights
 
 POSTING_M, SIDE = 10.0, 400
 DEM_SIGMA_M, SURFACE_SIGMA_M = 0.5, 0.3

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.map_grid import MapGrid
-from services.production.image_pairs import PARTNERS, image_pairs
-from services.sensors.ortho import OrthoModel
-from services.simulation.orbit import pushbroom_over
-from services.types import Acquisition, Array, BoolArray, IntArray
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.map_grid import MapGrid
+from amers.services.production.image_pairs import PARTNERS, image_pairs
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.simulation.orbit import pushbroom_over
+from amers.services.types import Acquisition, Array, BoolArray, IntArray
 
 GSD_M = 10.0
 SIDE = 100

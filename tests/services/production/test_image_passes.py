@@ -6,9 +6,9 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from services.production.from_images import _dates
-from services.production.image_passes import image_passes
-from services.types import Acquisition, Observations
+from amers.services.production.from_images import _dates
+from amers.services.production.image_passes import image_passes
+from amers.services.types import Acquisition, Observations
 
 START = datetime(2024, 5, 1, 10, tzinfo=UTC)
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import shapely
 
-from benchmarks._catalogue import simulate_catalogue
-from services.errors import CoverageError
-from services.imagery.catalogue import ImageCatalogue
-from services.production.image_selection import (
+from amers.services.errors import CoverageError
+from amers.services.imagery.catalogue import ImageCatalogue
+from amers.services.production.image_selection import (
     SelectionOptions,
     default_cell_m,
     duplicates,
@@ -18,6 +17,7 @@ from services.production.image_selection import (
     view_classes,
     with_cloud_from_masks,
 )
+from benchmarks._catalogue import simulate_catalogue
 
 AREA = shapely.box(13.5, -1.5, 16.5, 1.5)
 DAY = np.timedelta64(1, "D")

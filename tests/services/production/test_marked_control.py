@@ -6,12 +6,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.geodesy import move_metres
-from services.production.control import Control
-from services.production.from_images import Production
-from services.production.marked_control import MarkedGround
-from services.simulation.view import SimulatedView
-from services.types import Frame, Observations
+from amers.services.geodesy import move_metres
+from amers.services.production.control import Control
+from amers.services.production.from_images import Production
+from amers.services.production.marked_control import MarkedGround
+from amers.services.simulation.view import SimulatedView
+from amers.services.types import Frame, Observations
 from tests.services.production.simulated_control import CHI2_3, frame_error_m, free, placed, views
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]

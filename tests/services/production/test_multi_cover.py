@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import Bounds, LinearConstraint, linprog, milp
 
-from services.production.multi_cover import (
+from amers.services.production.multi_cover import (
     CoverProblem,
     bound_of,
     greedy_cover,

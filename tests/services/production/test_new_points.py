@@ -6,11 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.errors import ComputationError
-from services.geodesy import east_north_up, move_metres
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.production.new_points import (
+from amers.services.errors import ComputationError
+from amers.services.geodesy import east_north_up, move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.production.new_points import (
     NewPoints,
     ShortGround,
     overlapping_scenes,
@@ -19,12 +19,12 @@ from services.production.new_points import (
     short_ground,
     shown_twice,
 )
-from services.production.placed_block import moved_model
-from services.production.renewed_views import SeeingScene, with_new_points, with_new_views
-from services.quality.stability import image_places
-from services.registration.on_points import register_scene
-from services.registration.options import RegistrationOptions
-from services.types import Array, ChipSource, ControlPoints
+from amers.services.production.placed_block import moved_model
+from amers.services.production.renewed_views import SeeingScene, with_new_points, with_new_views
+from amers.services.quality.stability import image_places
+from amers.services.registration.on_points import register_scene
+from amers.services.registration.options import RegistrationOptions
+from amers.services.types import Array, ChipSource, ControlPoints
 from tests.services.block_with_hole import (
     HOLE_M,
     OLDER_SEED,

@@ -6,15 +6,15 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.errors import NotEnoughPoints
-from services.imagery.source import ArrayImage
-from services.production.control import Control
-from services.production.from_images import Production
-from services.production.height_control import ControlHeights
-from services.production.ortho_control import ControlOrtho
-from services.sensors.ortho import OrthoModel
-from services.terrain import Terrain
-from services.types import BoolArray, Frame
+from amers.services.errors import NotEnoughPoints
+from amers.services.imagery.source import ArrayImage
+from amers.services.production.control import Control
+from amers.services.production.from_images import Production
+from amers.services.production.height_control import ControlHeights
+from amers.services.production.ortho_control import ControlOrtho
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.terrain import Terrain
+from amers.services.types import BoolArray, Frame
 from tests.services.production.simulated_control import CHI2_3, frame_error_m, free, placed, views
 from tests.services.quality.test_site_images import vertical_ortho
 from tests.services.registration.test_on_reference import grid, positions

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.errors import NotEnoughPoints
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.production.control import Control
-from services.production.from_images import Production, produce_points
-from services.sensors.ortho import OrthoModel
-from services.types import Acquisition, Array
+from amers.services.errors import NotEnoughPoints
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.production.control import Control
+from amers.services.production.from_images import Production, produce_points
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Acquisition, Array
 from tests.services.production.simulated_control import CHI2_3, scenes, views
 from tests.services.production.test_ortho_control import heights, reference
 from tests.services.simulated import OPTIONS

@@ -6,14 +6,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.adjustment.control_ground import ControlGround
-from services.errors import NotEnoughPoints
-from services.imagery.source import ArrayImage
-from services.matching.reference_image import Reference
-from services.production.ortho_control import ControlOrtho, known_on_ortho
-from services.sensors.ortho import OrthoModel
-from services.tasks import Work
-from services.types import Array, Frame, no_progress
+from amers.services.adjustment.control_ground import ControlGround
+from amers.services.errors import NotEnoughPoints
+from amers.services.imagery.source import ArrayImage
+from amers.services.matching.reference_image import Reference
+from amers.services.production.ortho_control import ControlOrtho, known_on_ortho
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.tasks import Work
+from amers.services.types import Array, Frame, no_progress
 from tests.services.production.displaced_details import (
     GSD_M,
     Details,

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.adjustment.bundle import BlockAdjustment, adjust_block
-from services.errors import DisconnectedBlock, InputError
-from services.production.block_plan import (
+from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
+from amers.services.errors import DisconnectedBlock, InputError
+from amers.services.production.block_plan import (
     BlockPlan,
     PlanGeometry,
     PlannedHeights,
@@ -17,10 +17,10 @@ from services.production.block_plan import (
     observed_and_known,
     plan_geometry,
 )
-from services.production.planning import block_of, forecast
-from services.quality.normal_law import LINEAR_LE90, normal_ce90
-from services.sensors.correction import CorrectedModel
-from services.types import Array
+from amers.services.production.planning import block_of, forecast
+from amers.services.quality.normal_law import LINEAR_LE90, normal_ce90
+from amers.services.sensors.correction import CorrectedModel
+from amers.services.types import Array
 
 MIDDLE = (5.4, 43.3)
 EAST_DEG = 0.0616

@@ -8,16 +8,16 @@ import pytest
 import rasterio
 from pyproj import Transformer
 
-from services.adjustment.intersection import intersect
-from services.formats.elevation.dem import read_dem
-from services.imagery.scene import Scene
-from services.matching.ground_features import FeatureOptions
-from services.production.control import Control
-from services.production.from_images import Production, ProductionOptions, produce_points
-from services.production.height_control import ControlHeights
-from services.production.tie_points import find_tie_points
-from services.tasks import Work
-from services.types import Frame, no_progress
+from amers.services.adjustment.intersection import intersect
+from amers.services.formats.elevation.dem import read_dem
+from amers.services.imagery.scene import Scene
+from amers.services.matching.ground_features import FeatureOptions
+from amers.services.production.control import Control
+from amers.services.production.from_images import Production, ProductionOptions, produce_points
+from amers.services.production.height_control import ControlHeights
+from amers.services.production.tie_points import find_tie_points
+from amers.services.tasks import Work
+from amers.services.types import Frame, no_progress
 from tests.services.production.test_surface_heights import ElevationModel, read_triplet
 
 pytestmark = [pytest.mark.long, pytest.mark.real_data]

@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.conventions import CHIP_SIZE
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.production.new_points import NewPoints
-from services.production.renewed_views import (
+from amers.services.conventions import CHIP_SIZE
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.production.new_points import NewPoints
+from amers.services.production.renewed_views import (
     RenewedViews,
     SeeingScene,
     with_new_points,
     with_new_views,
 )
-from services.types import Acquisition, ControlPoints, Frame, SurfaceHeights
+from amers.services.types import Acquisition, ControlPoints, Frame, SurfaceHeights
 from tests.factories import affine_model, control_points
 from tests.services.simulated import MemoryChips
 

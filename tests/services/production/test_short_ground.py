@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from services.geodesy import move_metres
-from services.production.new_points import ShortGround
-from services.types import Array
+from amers.services.geodesy import move_metres
+from amers.services.production.new_points import ShortGround
+from amers.services.types import Array
 
 SPACING_M = 100.0
 CORNER = np.array([15.0, 50.0, 0.0])

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.production.point_views import surface_heights
-from services.types import Acquisition, Array, Views
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.production.point_views import surface_heights
+from amers.services.types import Acquisition, Array, Views
 from tests.services.conftest import GSD_M, FlatModel
 from tests.services.matching.test_surfaces_of_parts import Seen
 from tests.services.textures import as_pixels, texture

@@ -10,20 +10,20 @@ import rasterio
 from pyproj import Transformer
 from scipy.ndimage import map_coordinates
 
-from services.adjustment.intersection import intersect
-from services.formats.images.scenes import read_scene
-from services.geodesy import move_metres
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, Window, render_chip
-from services.matching.correlate import FOUND, CorrelationOptions, find_chip
-from services.matching.ground_features import FeatureOptions
-from services.matching.surface_heights import surface_height
-from services.production.from_images import Production, ProductionOptions, produce_points
-from services.production.tie_points import find_tie_points
-from services.simulation.view import SimulatedView, simulate_block
-from services.simulation.world import World
-from services.tasks import Work
-from services.types import Array, Observations, no_progress
+from amers.services.adjustment.intersection import intersect
+from amers.services.formats.images.scenes import read_scene
+from amers.services.geodesy import move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, Window, render_chip
+from amers.services.matching.correlate import FOUND, CorrelationOptions, find_chip
+from amers.services.matching.ground_features import FeatureOptions
+from amers.services.matching.surface_heights import surface_height
+from amers.services.production.from_images import Production, ProductionOptions, produce_points
+from amers.services.production.tie_points import find_tie_points
+from amers.services.simulation.view import SimulatedView, simulate_block
+from amers.services.simulation.world import World
+from amers.services.tasks import Work
+from amers.services.types import Array, Observations, no_progress
 from tests.services.simulated import (
     BLOCK_SIGMA_M,
     GSD_M,

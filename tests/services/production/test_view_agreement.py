@@ -6,11 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.errors import NotEnoughPoints
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, Window
-from services.production.view_agreement import AgreedViews, agreed_views
-from services.types import Acquisition, Array, Observations
+from amers.services.errors import NotEnoughPoints
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, Window
+from amers.services.production.view_agreement import AgreedViews, agreed_views
+from amers.services.types import Acquisition, Array, Observations
 from tests.services.conftest import FlatModel
 from tests.services.production.displaced_details import GSD_M, TILE_PX, drawn_details, map_moved
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.quality.accuracy import accuracy, normalised_error, sample_quantile, statistics
-from services.quality.normal_law import CIRCULAR_CE90, normal_ce90
+from amers.services.quality.accuracy import accuracy, normalised_error, sample_quantile, statistics
+from amers.services.quality.normal_law import CIRCULAR_CE90, normal_ce90
 
 a_ten_thousandth = 1e-4
 

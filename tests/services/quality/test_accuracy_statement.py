@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from services.quality.accuracy_statement import (
+from amers.services.quality.accuracy_statement import (
     accuracy_document,
     median_accuracy,
     no_accuracy,
@@ -11,9 +11,9 @@ from services.quality.accuracy_statement import (
     scene_accuracy,
     vertices_accuracy,
 )
-from services.quality.frames import frame_in_image
-from services.quality.normal_law import normal_ce90
-from services.types import UNKNOWN_FRAME, Frame
+from amers.services.quality.frames import frame_in_image
+from amers.services.quality.normal_law import normal_ce90
+from amers.services.types import UNKNOWN_FRAME, Frame
 
 a_percent = 0.01
 TILTED = Frame(np.array([[1.8, 0.3, 0.9], [0.3, 1.7, -2.0], [0.9, -2.0, 25.0]]))

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from services.formats.block.document import rectangle
-from services.quality.block_cells import block_cells, images_per_point, view_ages_years
-from services.quality.density import cell_of_points, covered_area_km2, density_cells
-from services.types import Acquisition, Array, ControlPoints
+from amers.services.formats.block.document import rectangle
+from amers.services.quality.block_cells import block_cells, images_per_point, view_ages_years
+from amers.services.quality.density import cell_of_points, covered_area_km2, density_cells
+from amers.services.types import Acquisition, Array, ControlPoints
 from tests.factories import control_points
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from services.geodesy import metres_per_degree, move_metres
-from services.imagery.source import ArrayImage
-from services.map_grid import MapGrid
-from services.quality.accuracy import effective_number, sample_quantile
-from services.quality.block_heights import HeightModel, height_errors, height_quality
-from services.quality.normal_law import LINEAR_LE90
-from services.terrain import Terrain
-from services.types import Array, ControlPoints, Frame, SurfaceHeights
+from amers.services.geodesy import metres_per_degree, move_metres
+from amers.services.imagery.source import ArrayImage
+from amers.services.map_grid import MapGrid
+from amers.services.quality.accuracy import effective_number, sample_quantile
+from amers.services.quality.block_heights import HeightModel, height_errors, height_quality
+from amers.services.quality.normal_law import LINEAR_LE90
+from amers.services.terrain import Terrain
+from amers.services.types import Array, ControlPoints, Frame, SurfaceHeights
 from tests.factories import control_points
 
 a_millimetre = 1e-3

@@ -5,27 +5,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.formats.block.document import rectangle
-from services.quality.accuracy import Quantile, accuracy
-from services.quality.block import (
+from amers.services.formats.block.document import rectangle
+from amers.services.quality.accuracy import Quantile, accuracy
+from amers.services.quality.block import (
     block_accuracy,
     block_quality,
     parse_quality_document,
     quality_document,
 )
-from services.quality.block_cells import BlockCells
-from services.quality.block_heights import HeightModel, height_errors, height_quality
-from services.quality.block_requirements import (
+from amers.services.quality.block_cells import BlockCells
+from amers.services.quality.block_heights import HeightModel, height_errors, height_quality
+from amers.services.quality.block_requirements import (
     BlockCriterion,
     BlockRequirements,
     block_criteria,
     block_verdict,
     outcome_of,
 )
-from services.quality.density import DensityCells
-from services.quality.normal_law import CIRCULAR_CE90, LINEAR_LE90
-from services.quality.planimetry import PlanimetricQuality
-from services.types import Frame
+from amers.services.quality.density import DensityCells
+from amers.services.quality.normal_law import CIRCULAR_CE90, LINEAR_LE90
+from amers.services.quality.planimetry import PlanimetricQuality
+from amers.services.types import Frame
 from tests.factories import control_points
 from tests.services.quality.test_block_heights import sloping_terrain
 from tests.services.quality.test_planimetric_figures import at_site, quality

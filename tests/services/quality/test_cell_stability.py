@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.errors import NotEnoughPoints
-from services.quality.cell_stability import CELLS, cells_of, measure_cell_stability
-from services.quality.stability import PLACES, image_places, measure_stability
+from amers.services.errors import NotEnoughPoints
+from amers.services.quality.cell_stability import CELLS, cells_of, measure_cell_stability
+from amers.services.quality.stability import PLACES, image_places, measure_stability
 from tests.services.conftest import Registered
 
 pytestmark = pytest.mark.thorough

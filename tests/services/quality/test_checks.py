@@ -5,12 +5,17 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from services.errors import CoverageError
-from services.geodesy import wrapped_degrees
-from services.quality.check_points import MARKING_SIGMA_PX, CheckPoints, check_model, with_check_points
-from services.quality.qualification import QualificationOptions, qualify
-from services.sensors.correction import CorrectedModel
-from services.types import UNKNOWN_FRAME, Array, Frame
+from amers.services.errors import CoverageError
+from amers.services.geodesy import wrapped_degrees
+from amers.services.quality.check_points import (
+    MARKING_SIGMA_PX,
+    CheckPoints,
+    check_model,
+    with_check_points,
+)
+from amers.services.quality.qualification import QualificationOptions, qualify
+from amers.services.sensors.correction import CorrectedModel
+from amers.services.types import UNKNOWN_FRAME, Array, Frame
 from tests.services.conftest import GSD_M, METRE_DEG, SHAPE, FlatModel, Registered
 
 LIMIT = 3.0

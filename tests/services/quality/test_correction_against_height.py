@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.adjustment.displacement_components import Component
-from services.quality.criteria import Criterion
-from services.quality.lack_of_fit import correction_against_height
-from services.quality.qualification import QualificationOptions, qualify
-from services.types import Array
+from amers.services.adjustment.displacement_components import Component
+from amers.services.quality.criteria import Criterion
+from amers.services.quality.lack_of_fit import correction_against_height
+from amers.services.quality.qualification import QualificationOptions, qualify
+from amers.services.types import Array
 from tests.services.conftest import Registered
 
 GSD_M = 0.5

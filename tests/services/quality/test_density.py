@@ -5,7 +5,7 @@ import pyproj
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from services.quality.density import box_area_km2, density_cells, share_reaching
+from amers.services.quality.density import box_area_km2, density_cells, share_reaching
 
 a_square_metre_km2 = 1e-6
 a_thousandth = 1e-3

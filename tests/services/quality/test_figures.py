@@ -5,16 +5,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from services.quality.criteria import (
+from amers.services.quality.criteria import (
     VERDICT_EXPLANATIONS,
     at_least,
     at_most,
     verdict_of,
     verdict_scope,
 )
-from services.quality.predicted import predict_accuracy
-from services.quality.qualification import second_consensus_share, unexplained_px
-from services.types import Array, Frame
+from amers.services.quality.predicted import predict_accuracy
+from amers.services.quality.qualification import second_consensus_share, unexplained_px
+from amers.services.types import Array, Frame
 from tests.services.conftest import METRE_DEG, FlatModel
 
 DRAWS = 200_000

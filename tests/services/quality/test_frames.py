@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from services.quality.frames import frame_in_image, shared_frame, weighted_frame
-from services.types import UNKNOWN_FRAME, Frame
+from amers.services.quality.frames import frame_in_image, shared_frame, weighted_frame
+from amers.services.types import UNKNOWN_FRAME, Frame
 from tests.factories import control_points
 
 a_tenth_of_a_percent = 1e-3

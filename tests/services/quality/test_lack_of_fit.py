@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from services.adjustment.structure import Family, Structure, unfollowed_variance_px2
-from services.quality.criteria import Criterion
-from services.quality.lack_of_fit import breaks_criterion, structure_criteria
+from amers.services.adjustment.structure import Family, Structure, unfollowed_variance_px2
+from amers.services.quality.criteria import Criterion
+from amers.services.quality.lack_of_fit import breaks_criterion, structure_criteria
 
 SIGHT = np.array([0.1, 0.0])
 SHAPE = (4000, 3000)

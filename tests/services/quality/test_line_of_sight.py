@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.matching.chip_shears import ChipShears
-from services.quality.line_of_sight import implied_sight, line_of_sight_criterion
-from services.types import Array
+from amers.services.matching.chip_shears import ChipShears
+from amers.services.quality.line_of_sight import implied_sight, line_of_sight_criterion
+from amers.services.types import Array
 
 SIGMA = 0.004
 """Of a shear: some tenths of a pixel over a chip."""

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import hypergeom
 
-from services.quality.lack_of_fit import missed_criterion
-from services.quality.missed_along import missed_along, missed_at_borders
+from amers.services.quality.lack_of_fit import missed_criterion
+from amers.services.quality.missed_along import missed_along, missed_at_borders
 
 LINES = 2000
 AWAY_PX = np.array([2.0, -1.0])

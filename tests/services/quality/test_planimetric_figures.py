@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 from numpy.testing import assert_allclose
 
-from services.imagery.source import ArrayImage
-from services.map_grid import MapGrid
-from services.matching.reference_image import Reference
-from services.quality.planimetry import PlanimetricQuality, planimetric_quality
-from services.quality.site_errors import (
+from amers.services.imagery.source import ArrayImage
+from amers.services.map_grid import MapGrid
+from amers.services.matching.reference_image import Reference
+from amers.services.quality.planimetry import PlanimetricQuality, planimetric_quality
+from amers.services.quality.site_errors import (
     POINTS,
     UNKNOWN_FRAME_SIGMA_M,
     Site,
     SiteErrors,
     expected_reach_m,
 )
-from services.sensors.ortho import OrthoModel
-from services.types import Array, Frame
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Array, Frame
 from tests.factories import control_points
 
 FRAME = Frame.from_sigmas(1.0, 1.0)

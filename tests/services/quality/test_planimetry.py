@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from services.geodesy import move_metres
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.map_grid import MapGrid
-from services.matching.reference_image import Reference
-from services.production.from_ortho import GroundHeights, OrthoPointOptions, produce_ortho_points
-from services.quality.planimetry import planimetric_quality
-from services.quality.site_errors import POINTS, Site, SiteErrors, expected_reach_m, point_errors
-from services.sensors.ortho import OrthoModel
-from services.types import Acquisition, Array, ControlPoints, Frame
+from amers.services.geodesy import move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.map_grid import MapGrid
+from amers.services.matching.reference_image import Reference
+from amers.services.production.from_ortho import GroundHeights, OrthoPointOptions, produce_ortho_points
+from amers.services.quality.planimetry import planimetric_quality
+from amers.services.quality.site_errors import POINTS, Site, SiteErrors, expected_reach_m, point_errors
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Acquisition, Array, ControlPoints, Frame
 from tests.services.simulated import MemoryChips
 from tests.services.textures import as_pixels, moved, texture
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from services.quality.criteria import Criterion
-from services.quality.lack_of_fit import (
+from amers.services.quality.criteria import Criterion
+from amers.services.quality.lack_of_fit import (
     Elsewhere,
     are_contiguous,
     chance_of_contiguous,

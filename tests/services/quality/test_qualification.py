@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.errors import NotEnoughPoints
-from services.quality.cell_stability import measure_cell_stability
-from services.quality.criteria import verdict_of, verdict_scope
-from services.quality.normal_law import CIRCULAR_CE90
-from services.quality.predicted import predict_accuracy
-from services.quality.qualification import (
+from amers.services.errors import NotEnoughPoints
+from amers.services.quality.cell_stability import measure_cell_stability
+from amers.services.quality.criteria import verdict_of, verdict_scope
+from amers.services.quality.normal_law import CIRCULAR_CE90
+from amers.services.quality.predicted import predict_accuracy
+from amers.services.quality.qualification import (
     QualificationOptions,
     count_points,
     image_coverage,
@@ -21,8 +21,8 @@ from services.quality.qualification import (
     second_consensus_share,
     unexplained_px,
 )
-from services.quality.stability import measure_stability, stability_of
-from services.types import Frame
+from amers.services.quality.stability import measure_stability, stability_of
+from amers.services.types import Frame
 from tests.services.conftest import GSD_M, Registered
 
 a_millionth_px = 1e-6

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from services.errors import InputError
-from services.geodesy import metres_per_degree_at
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, sample_image
-from services.quality.planimetry import planimetric_quality
-from services.quality.site_errors import Site, point_errors
-from services.quality.site_images import image_errors, least_inclined
-from services.sensors.correction import CorrectedModel, no_correction
-from services.simulation.view import simulate_view, true_ground
-from services.types import Frame
+from amers.services.errors import InputError
+from amers.services.geodesy import metres_per_degree_at
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, sample_image
+from amers.services.quality.planimetry import planimetric_quality
+from amers.services.quality.site_errors import Site, point_errors
+from amers.services.quality.site_images import image_errors, least_inclined
+from amers.services.sensors.correction import CorrectedModel, no_correction
+from amers.services.simulation.view import simulate_view, true_ground
+from amers.services.types import Frame
 from tests.services.registration.test_on_reference import grid, positions, reference, terrain
 from tests.services.simulated import block, block_views, plan, production, world
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from amers.services.errors import InputError
+from amers.services.geodesy import move_metres
+from amers.services.quality.site_reach import SiteReach, site_reach
+from amers.services.types import Frame
 from benchmarks._cape_verde import SITES, STEREO, Draw, draw
-from services.errors import InputError
-from services.geodesy import move_metres
-from services.quality.site_reach import SiteReach, site_reach
-from services.types import Frame
 
 pytestmark = pytest.mark.long
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from services.geodesy import lon_lat_h_from_east_north_up
-from services.quality.vanished import FALSE_SHARE, Searches, VanishedPoints, vanished_points
-from services.types import Array, BoolArray
+from amers.services.geodesy import lon_lat_h_from_east_north_up
+from amers.services.quality.vanished import FALSE_SHARE, Searches, VanishedPoints, vanished_points
+from amers.services.types import Array, BoolArray
 
 ORIGIN = np.array([179.999, 43.2, 100.0])
 """The points lie on both sides of the antimeridian."""

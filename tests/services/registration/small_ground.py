@@ -5,15 +5,15 @@ from functools import cache
 
 import numpy as np
 
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, CachedImage, Window, render_chip
-from services.map_grid import MapGrid
-from services.matching.multi_image import stored_chip
-from services.registration.context import PointContext, Prediction, RegistrationContext
-from services.registration.options import CoarseOptions, RegistrationOptions
-from services.registration.point_selection import initial_prediction
-from services.sensors.ortho import OrthoModel
-from services.types import (
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, CachedImage, Window, render_chip
+from amers.services.map_grid import MapGrid
+from amers.services.matching.multi_image import stored_chip
+from amers.services.registration.context import PointContext, Prediction, RegistrationContext
+from amers.services.registration.options import CoarseOptions, RegistrationOptions
+from amers.services.registration.point_selection import initial_prediction
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import (
     UNKNOWN_FRAME,
     Acquisition,
     Array,

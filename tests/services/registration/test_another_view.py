@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.errors import NoConsensus
-from services.production.from_images import produce_points
-from services.registration.on_points import register_scene
-from services.simulation.view import plan_geometry, simulate_block, simulate_view
-from services.simulation.world import make_world
-from services.types import Array
+from amers.services.errors import NoConsensus
+from amers.services.production.from_images import produce_points
+from amers.services.registration.on_points import register_scene
+from amers.services.simulation.view import plan_geometry, simulate_block, simulate_view
+from amers.services.simulation.world import make_world
+from amers.services.types import Array
 from tests.services.registration.small_ground import points_at, scene, whole
 from tests.services.simulated import BLOCK_SIGMA_M, GSD_M, OPTIONS, SHAPE, MemoryChips, plan
 

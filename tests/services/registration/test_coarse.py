@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.conventions import CHIP_CENTRE
-from services.errors import InputError, NoConsensus
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.registration.chip_selection import fine_gsd_m, has_chip, visibility_probability
-from services.registration.context import Prediction
-from services.registration.on_points import Registration, register_scene
-from services.registration.options import CoarseOptions, RegistrationOptions
-from services.sensors.correction import CorrectedModel, no_correction
-from services.simulation.view import SimulatedView, plan_geometry
-from services.types import Array, ControlPoints
+from amers.services.conventions import CHIP_CENTRE
+from amers.services.errors import InputError, NoConsensus
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.registration.chip_selection import fine_gsd_m, has_chip, visibility_probability
+from amers.services.registration.context import Prediction
+from amers.services.registration.on_points import Registration, register_scene
+from amers.services.registration.options import CoarseOptions, RegistrationOptions
+from amers.services.sensors.correction import CorrectedModel, no_correction
+from amers.services.simulation.view import SimulatedView, plan_geometry
+from amers.services.types import Array, ControlPoints
 from tests.services.simulated import block, plan, spoiled_view, world
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from services.errors import NoConsensus
-from services.imagery.scene import Scene
-from services.registration.coarse import search_coarsely
-from services.registration.context import Prediction, SearchStage
-from services.types import Array
+from amers.services.errors import NoConsensus
+from amers.services.imagery.scene import Scene
+from amers.services.registration.coarse import search_coarsely
+from amers.services.registration.context import Prediction, SearchStage
+from amers.services.types import Array
 from tests.services.registration.small_ground import (
     SIDE_PX,
     point_context,

@@ -5,11 +5,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.registration.on_points import Registration, register_scene
-from services.simulation.view import SimulatedView
-from services.types import FloatImage
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.registration.on_points import Registration, register_scene
+from amers.services.simulation.view import SimulatedView
+from amers.services.types import FloatImage
 from tests.services.simulated import block, spoiled_view
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]

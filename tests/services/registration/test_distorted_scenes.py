@@ -6,10 +6,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.errors import BrokenImage, NotEnoughPoints, TurnedImage
-from services.quality.normal_law import normal_ce90
-from services.registration.on_points import Registration, register_scene
-from services.simulation.distortion import (
+from amers.services.errors import BrokenImage, NotEnoughPoints, TurnedImage
+from amers.services.quality.normal_law import normal_ce90
+from amers.services.registration.on_points import Registration, register_scene
+from amers.services.simulation.distortion import (
     Bend,
     DistortedImage,
     Distortion,
@@ -18,7 +18,7 @@ from services.simulation.distortion import (
     Turn,
     Waves,
 )
-from services.types import Array
+from amers.services.types import Array
 from tests.services.registration.test_on_points import FIRST, SIGMA_M, frame_m, per_degree, view_of
 from tests.services.simulated import block, world
 

@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from services.errors import NoConsensus
-from services.imagery.source import ArrayImage, Window
-from services.registration.context import SearchStage
-from services.registration.on_points import Registration, register_scene
-from services.types import ChipArray, ChipSource
+from amers.services.errors import NoConsensus
+from amers.services.imagery.source import ArrayImage, Window
+from amers.services.registration.context import SearchStage
+from amers.services.registration.on_points import Registration, register_scene
+from amers.services.types import ChipArray, ChipSource
 from tests.services.registration.wide_ground import CENTRE, true_model, wide_points, wide_scene
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.conventions import CHIP_SIZE
-from services.errors import NoConsensus
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, Window
-from services.registration.context import Prediction, RegistrationContext, SearchStage
-from services.registration.far import search_far
-from services.types import Array
+from amers.services.conventions import CHIP_SIZE
+from amers.services.errors import NoConsensus
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, Window
+from amers.services.registration.context import Prediction, RegistrationContext, SearchStage
+from amers.services.registration.far import search_far
+from amers.services.types import Array
 from tests.services.registration.small_ground import (
     GSD_M,
     POINT_SIGMA_M,
@@ -95,7 +95,7 @@ def test_chips_and_map_are_reduced_until_the_work_is_bounded(
     points = 60
     _, stage = found(of, points=points)
     pixels = stage.tried * (2.0 * stage.needed_radius_m / GSD_M + CHIP_SIZE) ** 2
-    monkeypatch.setattr("services.registration.far.MAX_CORRELATED_PX", share * pixels / points)
+    monkeypatch.setattr("amers.services.registration.far.MAX_CORRELATED_PX", share * pixels / points)
     prediction, reduced = found(of, points=points)
     assert reduced.chip_gsd_m == reduction * GSD_M
     assert error_px(prediction, of, np.array([150.0, -160.0])) < 0.5 * reduction
@@ -104,7 +104,7 @@ def test_chips_and_map_are_reduced_until_the_work_is_bounded(
 def test_chips_are_reduced_until_the_map_holds_the_scene(monkeypatch: pytest.MonkeyPatch) -> None:
     """From its first to its last pixel a scene of 400 pixels has 399 of them: 798 m."""
     of = scene(OFF_M, SIGMA_M)
-    monkeypatch.setattr("services.registration.far.MAX_MAP_SIDE", 201)
+    monkeypatch.setattr("amers.services.registration.far.MAX_MAP_SIDE", 201)
     prediction, stage = found(of)
     assert stage.chip_gsd_m == 4.0
     assert np.isnan(stage.middle_m)
@@ -115,7 +115,7 @@ def test_of_a_scene_that_is_too_large_for_the_map_the_middle_is_searched(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     of = scene(np.array([40.0, -60.0]), 30.0)
-    monkeypatch.setattr("services.registration.far.MAX_MAP_SIDE", 301)
+    monkeypatch.setattr("amers.services.registration.far.MAX_MAP_SIDE", 301)
     prediction, stage = found(of, max_reduction=1)
     assert stage.middle_m == 301 * GSD_M
     assert error_px(prediction, of, np.array([40.0, -60.0])) < 0.3

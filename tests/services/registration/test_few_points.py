@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.conventions import CHIP_SIZE
-from services.registration.coarse import search_coarsely
-from services.registration.on_points import register_scene
-from services.registration.options import RegistrationOptions
-from services.registration.point_selection import points_to_try
-from services.types import Array, ControlPoints, Views
+from amers.services.conventions import CHIP_SIZE
+from amers.services.registration.coarse import search_coarsely
+from amers.services.registration.on_points import register_scene
+from amers.services.registration.options import RegistrationOptions
+from amers.services.registration.point_selection import points_to_try
+from amers.services.types import Array, ControlPoints, Views
 from tests.services.registration.small_ground import (
     SIDE_PX,
     point_context,

@@ -6,15 +6,15 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.adjustment.intersection import intersect
-from services.errors import ComputationError, CoverageError, NoConsensus, NotEnoughPoints
-from services.geodesy import metres_per_degree
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.matching.control_points import MatchingOptions
-from services.registration.on_points import Registration, register_scene
-from services.simulation.view import SimulatedView, simulate_view
-from services.types import Array, Observations
+from amers.services.adjustment.intersection import intersect
+from amers.services.errors import ComputationError, CoverageError, NoConsensus, NotEnoughPoints
+from amers.services.geodesy import metres_per_degree
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.matching.control_points import MatchingOptions
+from amers.services.registration.on_points import Registration, register_scene
+from amers.services.simulation.view import SimulatedView, simulate_view
+from amers.services.types import Array, Observations
 from tests.services.simulated import block, block_views, plan, production, spoiled_view, world
 
 pytestmark = pytest.mark.long

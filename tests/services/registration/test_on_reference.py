@@ -6,17 +6,17 @@ from functools import cache
 import numpy as np
 import pytest
 
-from services.errors import CoverageError, InputError, NoConsensus
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, Window, sample_image
-from services.map_grid import MapGrid, utm_of
-from services.matching.reference_image import Reference, ReferenceMatchingOptions
-from services.registration.on_points import Registration
-from services.registration.on_reference import register_on_reference
-from services.registration.options import ReferenceOptions, RegistrationOptions
-from services.sensors.ortho import OrthoModel
-from services.simulation.view import SimulatedView, true_ground
-from services.terrain import Terrain
+from amers.services.errors import CoverageError, InputError, NoConsensus
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, Window, sample_image
+from amers.services.map_grid import MapGrid, utm_of
+from amers.services.matching.reference_image import Reference, ReferenceMatchingOptions
+from amers.services.registration.on_points import Registration
+from amers.services.registration.on_reference import register_on_reference
+from amers.services.registration.options import ReferenceOptions, RegistrationOptions
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.simulation.view import SimulatedView, true_ground
+from amers.services.terrain import Terrain
 from tests.services.simulated import block_views, spoiled_view, world
 
 pytestmark = pytest.mark.long

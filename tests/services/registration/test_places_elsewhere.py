@@ -5,17 +5,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from services.adjustment.image_correction import AdjustmentOptions
-from services.conventions import CHIP_SIZE
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, CachedImage, Window
-from services.matching.control_points import ChipSearch, PointMatches, match_points
-from services.quality.lack_of_fit import Elsewhere
-from services.registration.context import PointContext
-from services.registration.elsewhere import adjust_with_places
-from services.registration.options import RegistrationOptions
-from services.registration.search import Search, adjust_search, select_inliers
-from services.types import (
+from amers.services.adjustment.image_correction import AdjustmentOptions
+from amers.services.conventions import CHIP_SIZE
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, CachedImage, Window
+from amers.services.matching.control_points import ChipSearch, PointMatches, match_points
+from amers.services.quality.lack_of_fit import Elsewhere
+from amers.services.registration.context import PointContext
+from amers.services.registration.elsewhere import adjust_with_places
+from amers.services.registration.options import RegistrationOptions
+from amers.services.registration.search import Search, adjust_search, select_inliers
+from amers.services.types import (
     Acquisition,
     Array,
     BoolArray,

@@ -4,11 +4,11 @@ from functools import cache
 
 import numpy as np
 
-from services.geodesy import move_metres
-from services.joint.measured import MeasuredScene
-from services.registration.point_results import point_results
-from services.sensors.correction import CorrectedModel
-from services.types import Measures
+from amers.services.geodesy import move_metres
+from amers.services.joint.measured import MeasuredScene
+from amers.services.registration.point_results import point_results
+from amers.services.sensors.correction import CorrectedModel
+from amers.services.types import Measures
 from tests.services.joint.test_joint_block import observed, truth_of
 
 

@@ -5,23 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.conventions import CHIP_CENTRE
-from services.errors import CoverageError
-from services.geodesy import move_metres
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.matching.chip_extent import MIN_VISIBLE_SIDE
-from services.registration.chip_selection import visibility_probability
-from services.registration.context import Prediction
-from services.registration.point_selection import (
+from amers.services.conventions import CHIP_CENTRE
+from amers.services.errors import CoverageError
+from amers.services.geodesy import move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.matching.chip_extent import MIN_VISIBLE_SIDE
+from amers.services.registration.chip_selection import visibility_probability
+from amers.services.registration.context import Prediction
+from amers.services.registration.point_selection import (
     initial_prediction,
     points_expected,
     points_to_try,
     visible_points,
 )
-from services.sensors.correction import CorrectedModel, no_correction
-from services.simulation.view import plan_geometry
-from services.types import Array, BoolArray, ControlPoints
+from amers.services.sensors.correction import CorrectedModel, no_correction
+from amers.services.simulation.view import plan_geometry
+from amers.services.types import Array, BoolArray, ControlPoints
 from tests.services.simulated import block, plan, world
 
 SIZE_PX = 360

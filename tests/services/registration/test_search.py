@@ -5,25 +5,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.errors import NoConsensus, NotEnoughPoints
-from services.geodesy import ecef_from_east_north_up, ecef_from_lon_lat_h
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.map_grid import MapGrid
-from services.matching.consensus import Consensus, Voters
-from services.matching.control_points import PointMatches
-from services.registration.context import SearchStage
-from services.registration.search import (
+from amers.services.errors import NoConsensus, NotEnoughPoints
+from amers.services.geodesy import ecef_from_east_north_up, ecef_from_lon_lat_h
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.map_grid import MapGrid
+from amers.services.matching.consensus import Consensus, Voters
+from amers.services.matching.control_points import PointMatches
+from amers.services.registration.context import SearchStage
+from amers.services.registration.search import (
     check_consensus,
     check_inliers,
     first_consensus,
     predict,
     summarise,
 )
-from services.sensors.base import SensorModel
-from services.sensors.ortho import OrthoModel
-from services.simulation.orbit import pushbroom_over
-from services.types import Acquisition, Array, ViewMeasures
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.simulation.orbit import pushbroom_over
+from amers.services.types import Acquisition, Array, ViewMeasures
 from tests.factories import control_points
 from tests.services.conftest import GSD_M as FLAT_GSD_M
 from tests.services.conftest import SHAPE, FlatModel, register

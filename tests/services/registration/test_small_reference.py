@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.errors import NoConsensus
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, Window
-from services.matching.reference_image import Reference
-from services.registration.context import SearchStage
-from services.registration.on_points import Registration
-from services.registration.on_reference import register_on_reference
-from services.registration.options import ReferenceOptions, RegistrationOptions
-from services.sensors.ortho import OrthoModel
-from services.types import Array
+from amers.services.errors import NoConsensus
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, Window
+from amers.services.matching.reference_image import Reference
+from amers.services.registration.context import SearchStage
+from amers.services.registration.on_points import Registration
+from amers.services.registration.on_reference import register_on_reference
+from amers.services.registration.options import ReferenceOptions, RegistrationOptions
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import Array
 from tests.services.registration.small_ground import GRID, GSD_M, scene, whole
 
 OPTIONS = RegistrationOptions(reference=ReferenceOptions(places=100, leading_places=36))

@@ -5,10 +5,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage
-from services.registration.turned import turned_scenes
-from services.types import Acquisition, FloatImage
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage
+from amers.services.registration.turned import turned_scenes
+from amers.services.types import Acquisition, FloatImage
 from tests.services.conftest import FlatModel
 
 LINES, SAMPLES = 7, 10

@@ -6,14 +6,14 @@ from functools import cache
 import cv2
 import numpy as np
 
-from services.conventions import CHIP_SIZE
-from services.geodesy import east_north_up, lon_lat_h_from_east_north_up
-from services.imagery.scene import Scene
-from services.imagery.source import ArrayImage, chip_ground
-from services.sensors.base import SensorModel
-from services.sensors.correction import CorrectedModel, no_correction
-from services.simulation.orbit import pushbroom_over
-from services.types import (
+from amers.services.conventions import CHIP_SIZE
+from amers.services.geodesy import east_north_up, lon_lat_h_from_east_north_up
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ArrayImage, chip_ground
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.correction import CorrectedModel, no_correction
+from amers.services.simulation.orbit import pushbroom_over
+from amers.services.types import (
     UNKNOWN_FRAME,
     Acquisition,
     Array,

@@ -7,14 +7,14 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from services.quality.accuracy import accuracy
-from services.quality.qualification import QualificationOptions, qualify
-from services.registration.context import SearchStage
-from services.registration.on_points import Registration
-from services.registration.options import RegistrationOptions
-from services.reports.build import build_report
-from services.reports.figure_data import ChipComparison, FigureData, Quicklook
-from services.reports.report import (
+from amers.services.quality.accuracy import accuracy
+from amers.services.quality.qualification import QualificationOptions, qualify
+from amers.services.registration.context import SearchStage
+from amers.services.registration.on_points import Registration
+from amers.services.registration.options import RegistrationOptions
+from amers.services.reports.build import build_report
+from amers.services.reports.figure_data import ChipComparison, FigureData, Quicklook
+from amers.services.reports.report import (
     BlockUsed,
     Check,
     RefinedModelRecord,
@@ -22,8 +22,8 @@ from services.reports.report import (
     RunRecord,
     SceneRecord,
 )
-from services.sensors.correction import CorrectedModel
-from services.types import Acquisition, FloatImage, Frame, Measures, ViewMeasures
+from amers.services.sensors.correction import CorrectedModel
+from amers.services.types import Acquisition, FloatImage, Frame, Measures, ViewMeasures
 from tests.services.conftest import FlatModel
 
 FRAME = Frame.from_sigmas(1.5, 2.5)

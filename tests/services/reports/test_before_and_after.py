@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from services.registration.on_points import register_scene
-from services.reports.figure_data import ChipComparison, FigureData, figure_data
-from services.types import Array, ChipArray
+from amers.services.registration.on_points import register_scene
+from amers.services.reports.figure_data import ChipComparison, FigureData, figure_data
+from amers.services.types import Array, ChipArray
 from tests.services.registration.test_on_points import frame_m
 from tests.services.simulated import block, spoiled_view
 

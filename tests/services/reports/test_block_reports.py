@@ -7,32 +7,32 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from services.formats.block.document import rectangle
-from services.production.block_plan import BlockPlan, PlannedImage, PlannedSite
-from services.production.block_residuals import FITS, ImageFit, PointFits
-from services.production.planning import Accuracy90, Forecast, ImageForecast, ProposedSite
-from services.quality.accuracy_statement import median_accuracy
-from services.quality.block_cells import block_cells
-from services.quality.block_requirements import BlockRequirements
-from services.quality.planimetry import planimetric_quality
-from services.reports.block_adjustment import (
+from amers.services.formats.block.document import rectangle
+from amers.services.production.block_plan import BlockPlan, PlannedImage, PlannedSite
+from amers.services.production.block_residuals import FITS, ImageFit, PointFits
+from amers.services.production.planning import Accuracy90, Forecast, ImageForecast, ProposedSite
+from amers.services.quality.accuracy_statement import median_accuracy
+from amers.services.quality.block_cells import block_cells
+from amers.services.quality.block_requirements import BlockRequirements
+from amers.services.quality.planimetry import planimetric_quality
+from amers.services.reports.block_adjustment import (
     ALL_FITS,
     LOOK_AT,
     AdjustmentReport,
     ControlFit,
     adjustment_document,
 )
-from services.reports.block_adjustment import points_csv as points_of_block
-from services.reports.block_quality import (
+from amers.services.reports.block_adjustment import points_csv as points_of_block
+from amers.services.reports.block_quality import (
     BlockIdentification,
     Measured,
     MeasuredErrors,
     block_quality_report,
     degree_words,
 )
-from services.reports.plan import PlanReport, plan_document, points_csv
-from services.reports.selection import share_words
-from services.types import Frame
+from amers.services.reports.plan import PlanReport, plan_document, points_csv
+from amers.services.reports.selection import share_words
+from amers.services.types import Frame
 from tests.factories import control_points
 from tests.services.quality.test_planimetric_figures import FRAME, at_site
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator, ValidationError
 
-from services.reports.document import format_report, report_document, report_schema
-from services.reports.reasons import count_reasons
+from amers.services.reports.document import format_report, report_document, report_schema
+from amers.services.reports.reasons import count_reasons
 
 
 def refuse(constant):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 
-from services.errors import (
+from amers.services.errors import (
     BrokenImage,
     CoverageError,
     FormatError,
@@ -15,10 +15,10 @@ from services.errors import (
     NotEnoughPoints,
     TurnedImage,
 )
-from services.registration.context import Candidate, NotFound, SearchStage
-from services.registration.options import RegistrationOptions
-from services.reports.document import failure_schema, report_document
-from services.reports.failure import (
+from amers.services.registration.context import Candidate, NotFound, SearchStage
+from amers.services.registration.options import RegistrationOptions
+from amers.services.reports.document import failure_schema, report_document
+from amers.services.reports.failure import (
     EXPLANATION,
     FAILURE_FORMAT,
     NO_ACCURACY,
@@ -28,8 +28,8 @@ from services.reports.failure import (
     next_steps,
     significance_words,
 )
-from services.reports.failure_pages import format_failure_html, format_failure_tables
-from services.reports.report import RunRecord
+from amers.services.reports.failure_pages import format_failure_html, format_failure_tables
+from amers.services.reports.report import RunRecord
 from tests.services.reports.test_html import HOSTILE, Page
 
 COMMAND = "amers scene register scene.tif --block points -o out"

@@ -9,18 +9,18 @@ import cv2
 import numpy as np
 import pytest
 
-from services.quality.criteria import Criterion
-from services.registration.options import RegistrationOptions
-from services.reports.charts import funnel
-from services.reports.criteria_rows import margin_words
-from services.reports.drawing import ACTIVE, ARROW, round_number
-from services.reports.figure_data import Quicklook
-from services.reports.figures import FIGURES, figure_markup
-from services.reports.html import chip_uri, choose_comparisons, flat_options, format_html
-from services.reports.maps import coverage_map, residual_map
-from services.reports.numbers import metres, number
-from services.reports.plot import tick_words, ticks
-from services.types import Acquisition
+from amers.services.quality.criteria import Criterion
+from amers.services.registration.options import RegistrationOptions
+from amers.services.reports.charts import funnel
+from amers.services.reports.criteria_rows import margin_words
+from amers.services.reports.drawing import ACTIVE, ARROW, round_number
+from amers.services.reports.figure_data import Quicklook
+from amers.services.reports.figures import FIGURES, figure_markup
+from amers.services.reports.html import chip_uri, choose_comparisons, flat_options, format_html
+from amers.services.reports.maps import coverage_map, residual_map
+from amers.services.reports.numbers import metres, number
+from amers.services.reports.plot import tick_words, ticks
+from amers.services.types import Acquisition
 
 HOSTILE = "<script>alert('x')</script>\"&$\\frac"
 most_characters_of_images = 700_000

@@ -2,7 +2,7 @@
 
 import math
 
-from services.reports.overview import OverviewRow, format_overview
+from amers.services.reports.overview import OverviewRow, format_overview
 
 HOSTILE = "<script>alert(1)</script>.tif"
 

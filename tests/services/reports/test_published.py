@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from services.reports.published import published_tables
+from amers.services.reports.published import published_tables
 
 
 def values(table):

@@ -7,11 +7,11 @@ from html import unescape
 import numpy as np
 import pytest
 
-from services.quality.accuracy import sample_quantile
-from services.reports.document import report_document
-from services.reports.html import format_html
-from services.reports.numbers import number, quantile
-from services.reports.tables import format_tables
+from amers.services.quality.accuracy import sample_quantile
+from amers.services.reports.document import report_document
+from amers.services.reports.html import format_html
+from amers.services.reports.numbers import number, quantile
+from amers.services.reports.tables import format_tables
 
 
 def row(text, start):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from services.sensors.attitude import integrated_rates, interpolated_attitude, orbital_attitude
-from services.sensors.piecewise import polynomial
+from amers.services.sensors.attitude import integrated_rates, interpolated_attitude, orbital_attitude
+from amers.services.sensors.piecewise import polynomial
 
 rounding = 1e-12
 

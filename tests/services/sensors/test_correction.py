@@ -9,9 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
-from services.formats.sensor_models.rpc_text import parse_rpc_text
-from services.sensors.correction import CorrectedModel, ImageCorrection, fold_into_rpc, no_correction
-from services.sensors.displacement import DisplacementGrid
+from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
+from amers.services.sensors.correction import (
+    CorrectedModel,
+    ImageCorrection,
+    fold_into_rpc,
+    no_correction,
+)
+from amers.services.sensors.displacement import DisplacementGrid
 
 MODEL = parse_rpc_text((Path(__file__).parents[2] / "golden" / "invented_RPC.TXT").read_text())
 SHAPE = (26000, 26500)

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from services.geodesy import ecef_from_lon_lat_h, lon_lat_h_from_east_north_up
-from services.sensors.light_path import (
+from amers.services.geodesy import ecef_from_lon_lat_h, lon_lat_h_from_east_north_up
+from amers.services.sensors.light_path import (
     EARTH_ROTATION_RAD_S,
     SPEED_OF_LIGHT_M_S,
     LightPath,
     zenith_path_excess_m,
 )
-from services.sensors.pushbroom import PushbroomModel
-from services.simulation.orbit import pushbroom_over
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.simulation.orbit import pushbroom_over
 
 SHAPE = (3000, 2000)
 HEIGHTS_M = (-100.0, 4000.0)

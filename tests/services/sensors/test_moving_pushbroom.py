@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.sensors.correction import ImageCorrection, no_correction
-from services.sensors.displacement import DisplacementGrid
-from services.sensors.moving_pushbroom import attitude_motion, moving_model
-from services.sensors.pushbroom import PushbroomModel, check_pushbroom
-from services.sensors.pushbroom_errors import TERMS, PushbroomErrors
-from services.simulation.orbit import pushbroom_over
-from services.types import Array
+from amers.services.sensors.correction import ImageCorrection, no_correction
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.sensors.moving_pushbroom import attitude_motion, moving_model
+from amers.services.sensors.pushbroom import PushbroomModel, check_pushbroom
+from amers.services.sensors.pushbroom_errors import TERMS, PushbroomErrors
+from amers.services.simulation.orbit import pushbroom_over
+from amers.services.types import Array
 
 SHAPE = (3000, 2000)
 HEIGHTS_M = (0.0, 1500.0)

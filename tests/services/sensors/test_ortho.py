@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from services.adjustment.control_observations import ControlObservations
-from services.adjustment.image_correction import AdjustmentOptions, adjust_scene
-from services.geodesy import ecef_from_lon_lat_h, metres_per_degree_at
-from services.imagery.scene import view_direction
-from services.map_grid import MapGrid
-from services.sensors.correction import CorrectedModel, ImageCorrection
-from services.sensors.ortho import OrthoModel, ReliefDisplacement, fold_into_ortho
+from amers.services.adjustment.control_observations import ControlObservations
+from amers.services.adjustment.image_correction import AdjustmentOptions, adjust_scene
+from amers.services.geodesy import ecef_from_lon_lat_h, metres_per_degree_at
+from amers.services.imagery.scene import view_direction
+from amers.services.map_grid import MapGrid
+from amers.services.sensors.correction import CorrectedModel, ImageCorrection
+from amers.services.sensors.ortho import OrthoModel, ReliefDisplacement, fold_into_ortho
 
 a_micropixel = 1e-6
 a_nanometre = 1e-9

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from scipy.interpolate import BarycentricInterpolator
 
-from services.sensors.piecewise import extended, from_function, hermite, lagrange, linear, polynomial
+from amers.services.sensors.piecewise import (
+    extended,
+    from_function,
+    hermite,
+    lagrange,
+    linear,
+    polynomial,
+)
 
 rounding = 1e-9
 

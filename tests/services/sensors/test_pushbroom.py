@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from services.geodesy import (
+from amers.services.geodesy import (
     ecef_from_lon_lat_h,
     lon_lat_h_from_east_north_up,
     lon_lat_h_from_ecef,
 )
-from services.imagery.scene import view_direction
-from services.imagery.source import image_gsd_m
-from services.sensors.pushbroom import PushbroomModel
-from services.simulation.orbit import pushbroom_over
+from amers.services.imagery.scene import view_direction
+from amers.services.imagery.source import image_gsd_m
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.simulation.orbit import pushbroom_over
 
 TARGET = np.array([5.4, 43.6, 250.0])
 SHAPE = (1200, 900)

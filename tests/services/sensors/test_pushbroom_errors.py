@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.geodesy import ecef_from_lon_lat_h
-from services.sensors.light_path import LightPath
-from services.sensors.pushbroom import PushbroomModel
-from services.sensors.pushbroom_errors import TERMS, PushbroomErrors
-from services.simulation.orbit import pushbroom_over
+from amers.services.geodesy import ecef_from_lon_lat_h
+from amers.services.sensors.light_path import LightPath
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.sensors.pushbroom_errors import TERMS, PushbroomErrors
+from amers.services.simulation.orbit import pushbroom_over
 
 SHAPE = (3000, 2000)
 size = np.array([1e-5, 1e-5, 1e-3, 1e-5, 1e-5, 1e-3, 10.0, 10.0, 10.0, 0.5, 0.5, 0.5, 1e-3, 1e-3])

@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rasterio.transform import RPCTransformer
 
-from services.errors import FormatError
-from services.formats.images.raster import gdal_rpc
-from services.formats.sensor_models.rpc_text import parse_rpc_text
-from services.geodesy import ecef_from_lon_lat_h, lon_lat_h_from_east_north_up
-from services.sensors.rpc import RpcModel, check_rpc
-from services.types import Array
+from amers.services.errors import FormatError
+from amers.services.formats.images.raster import gdal_rpc
+from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
+from amers.services.geodesy import ecef_from_lon_lat_h, lon_lat_h_from_east_north_up
+from amers.services.sensors.rpc import RpcModel, check_rpc
+from amers.services.types import Array
 
 MODEL = parse_rpc_text((Path(__file__).parents[2] / "golden" / "invented_RPC.TXT").read_text())
 

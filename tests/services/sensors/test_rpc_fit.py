@@ -5,13 +5,18 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from services.errors import CoverageError
-from services.sensors.correction import CorrectedModel, ImageCorrection, fold_into_rpc, no_correction
-from services.sensors.pushbroom import PushbroomModel
-from services.sensors.rpc import check_rpc, cubic_terms
-from services.sensors.rpc_fit import fit_rpc, fit_to_ground
-from services.simulation.orbit import pushbroom_over
-from services.types import Array
+from amers.services.errors import CoverageError
+from amers.services.sensors.correction import (
+    CorrectedModel,
+    ImageCorrection,
+    fold_into_rpc,
+    no_correction,
+)
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.sensors.rpc import check_rpc, cubic_terms
+from amers.services.sensors.rpc_fit import fit_rpc, fit_to_ground
+from amers.services.simulation.orbit import pushbroom_over
+from amers.services.types import Array
 
 HEIGHTS_M = (50.0, 850.0)
 a_hundredth_of_a_pixel = 0.01

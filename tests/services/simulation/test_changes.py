@@ -6,9 +6,9 @@ from datetime import date
 import numpy as np
 import pytest
 
-from services.simulation.changes import Change, apply_changes, draw_changes, scatter_things
-from services.simulation.land import NO_ROOF, WATER
-from services.simulation.world import World, flood, make_world
+from amers.services.simulation.changes import Change, apply_changes, draw_changes, scatter_things
+from amers.services.simulation.land import NO_ROOF, WATER
+from amers.services.simulation.world import World, flood, make_world
 
 FIRST, LAST = date(2020, 1, 1), date(2024, 1, 1)
 a_percent_a_year = 0.01

@@ -6,13 +6,13 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from services.errors import InputError
-from services.imagery.source import Window
-from services.simulation.conditions import CLEAR, CLOUD_LIGHT, Conditions, clouds_over
-from services.simulation.light import day_of, radiance
-from services.simulation.tiles import TiledView
-from services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
-from services.simulation.world import World, make_world
+from amers.services.errors import InputError
+from amers.services.imagery.source import Window
+from amers.services.simulation.conditions import CLEAR, CLOUD_LIGHT, Conditions, clouds_over
+from amers.services.simulation.light import day_of, radiance
+from amers.services.simulation.tiles import TiledView
+from amers.services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
+from amers.services.simulation.world import World, make_world
 
 SHAPE = (300, 340)
 a_twentieth = 0.05

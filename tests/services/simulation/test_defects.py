@@ -4,15 +4,15 @@ import cv2
 import numpy as np
 import pytest
 
-from services.errors import InputError
-from services.imagery.source import ArrayImage, Window
-from services.simulation.defects import Damage, DamagedImage
-from services.simulation.detectors import Detectors
-from services.simulation.render import BRIGHTEST, Radiometry
-from services.simulation.tiles import TILE_PX, TiledView
-from services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
-from services.simulation.world import World, make_world, with_smoother_terrain
-from services.types import Array
+from amers.services.errors import InputError
+from amers.services.imagery.source import ArrayImage, Window
+from amers.services.simulation.defects import Damage, DamagedImage
+from amers.services.simulation.detectors import Detectors
+from amers.services.simulation.render import BRIGHTEST, Radiometry
+from amers.services.simulation.tiles import TILE_PX, TiledView
+from amers.services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
+from amers.services.simulation.world import World, make_world, with_smoother_terrain
+from amers.services.types import Array
 
 SHAPE = (700, 900)
 WHOLE = Window(0, 0, *SHAPE)

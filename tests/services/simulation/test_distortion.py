@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from services.imagery.source import ArrayImage, Window
-from services.simulation.distortion import (
+from amers.services.imagery.source import ArrayImage, Window
+from amers.services.simulation.distortion import (
     Bend,
     DistortedImage,
     Distortion,
@@ -14,11 +14,11 @@ from services.simulation.distortion import (
     Step,
     Waves,
 )
-from services.simulation.render import Radiometry, surface_seen
-from services.simulation.tiles import TiledView
-from services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
-from services.simulation.world import World, make_world
-from services.types import Array, FloatImage
+from amers.services.simulation.render import Radiometry, surface_seen
+from amers.services.simulation.tiles import TiledView
+from amers.services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
+from amers.services.simulation.world import World, make_world
+from amers.services.types import Array, FloatImage
 
 SHAPE = (300, 330)
 WHOLE = Window(0, 0, *SHAPE)

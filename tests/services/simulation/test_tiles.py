@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.imagery.source import Window
-from services.simulation.conditions import Conditions
-from services.simulation.render import Radiometry
-from services.simulation.tiles import TILE_PX, TiledView
-from services.simulation.view import ViewGeometry, ViewPlan, plan_geometry, render_view
-from services.simulation.world import World, make_world
+from amers.services.imagery.source import Window
+from amers.services.simulation.conditions import Conditions
+from amers.services.simulation.render import Radiometry
+from amers.services.simulation.tiles import TILE_PX, TiledView
+from amers.services.simulation.view import ViewGeometry, ViewPlan, plan_geometry, render_view
+from amers.services.simulation.world import World, make_world
 
 SHAPE = (210, 333)
 ROUNDED_OTHERWISE = 1e-4

@@ -6,13 +6,13 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from services.errors import InputError
-from services.imagery.source import render_chip
-from services.sensors.correction import CorrectedModel
-from services.simulation.land import NO_ROOF
-from services.simulation.light import radiance_of_day, smooth_radiance
-from services.simulation.render import Radiometry, ray_setup, render
-from services.simulation.view import (
+from amers.services.errors import InputError
+from amers.services.imagery.source import render_chip
+from amers.services.sensors.correction import CorrectedModel
+from amers.services.simulation.land import NO_ROOF
+from amers.services.simulation.light import radiance_of_day, smooth_radiance
+from amers.services.simulation.render import Radiometry, ray_setup, render
+from amers.services.simulation.view import (
     SimulatedView,
     ViewPlan,
     plan_geometry,
@@ -22,7 +22,7 @@ from services.simulation.view import (
     true_ground,
     true_line_sample,
 )
-from services.simulation.world import World, make_world
+from amers.services.simulation.world import World, make_world
 
 two_hundredths_of_a_pixel = 0.02
 a_hundredth_of_a_pixel = 0.01

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from services.geodesy import east_north_up
-from services.simulation.land import ESTATE_LOT_M, NO_ROOF
-from services.simulation.world import World, make_world
+from amers.services.geodesy import east_north_up
+from amers.services.simulation.land import ESTATE_LOT_M, NO_ROOF
+from amers.services.simulation.world import World, make_world
 
 a_micrometre = 1e-6
 

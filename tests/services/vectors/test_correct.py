@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 import shapely
 
-from services.geodesy import metres_per_degree_at
-from services.imagery.source import ArrayImage, Window
-from services.lines_of_sight import intersect_terrain
-from services.map_grid import xy_of_lon_lat
-from services.quality.accuracy import normalised_error
-from services.quality.correction_accuracy import CorrectionAccuracy
-from services.sensors.correction import CorrectedModel, no_correction
-from services.terrain import Terrain
-from services.types import UNKNOWN_FRAME, Array, BoolArray, Frame
-from services.vectors.accuracy import ErrorSources, predict_vertices
-from services.vectors.correct import CorrectedVectors, correct_vectors, missed_place
-from services.vectors.project import HIDDEN_M, project_vectors
-from services.vectors.shapes import Geometries, geometries_of, shapes_of
+from amers.services.geodesy import metres_per_degree_at
+from amers.services.imagery.source import ArrayImage, Window
+from amers.services.lines_of_sight import intersect_terrain
+from amers.services.map_grid import xy_of_lon_lat
+from amers.services.quality.accuracy import normalised_error
+from amers.services.quality.correction_accuracy import CorrectionAccuracy
+from amers.services.sensors.correction import CorrectedModel, no_correction
+from amers.services.terrain import Terrain
+from amers.services.types import UNKNOWN_FRAME, Array, BoolArray, Frame
+from amers.services.vectors.accuracy import ErrorSources, predict_vertices
+from amers.services.vectors.correct import CorrectedVectors, correct_vectors, missed_place
+from amers.services.vectors.project import HIDDEN_M, project_vectors
+from amers.services.vectors.shapes import Geometries, geometries_of, shapes_of
 from tests.services.vectors_world import CRS, DEM, GSD_M, SHAPE, heights, image_places, scene, terrain
 
 a_millimetre = 1e-3

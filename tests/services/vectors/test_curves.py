@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import shapely
 
-from services.types import Array
-from services.vectors.curves import Curves, Transformation, curved
-from services.vectors.shapes import shapes_of
+from amers.services.types import Array
+from amers.services.vectors.curves import Curves, Transformation, curved
+from amers.services.vectors.shapes import shapes_of
 
 TOLERANCE = 0.05
 

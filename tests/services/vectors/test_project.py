@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import shapely
 
-from services.errors import InputError
-from services.map_grid import xy_of_lon_lat
-from services.vectors.accuracy import ErrorSources
-from services.vectors.correct import correct_vectors
-from services.vectors.project import (
+from amers.services.errors import InputError
+from amers.services.map_grid import xy_of_lon_lat
+from amers.services.vectors.accuracy import ErrorSources
+from amers.services.vectors.correct import correct_vectors
+from amers.services.vectors.project import (
     ProjectedVectors,
     cut,
     ground_outline,
@@ -18,7 +18,7 @@ from services.vectors.project import (
     image_outline,
     project_vectors,
 )
-from services.vectors.shapes import geometries_of, shapes_of
+from amers.services.vectors.shapes import geometries_of, shapes_of
 from tests.services.vectors_world import CRS, SHAPE, heights, image_places, scene, terrain
 
 the_tolerance_px = 0.2

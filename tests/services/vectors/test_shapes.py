@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import shapely
 
-from services.errors import InputError
-from services.vectors.shapes import geometries_of, place_of, shapes_of
+from amers.services.errors import InputError
+from amers.services.vectors.shapes import geometries_of, place_of, shapes_of
 
 WKT = [
     "POINT (1 2)",

@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.errors import FormatError
-from services.formats.block.check import check_block
-from services.formats.block.problems import BlockProblems
-from services.formats.block.reader import FolderChips
+from amers.services.errors import FormatError
+from amers.services.formats.block.check import check_block
+from amers.services.formats.block.problems import BlockProblems
+from amers.services.formats.block.reader import FolderChips
 from tests.factories import MadeBlock, make_block
 
 

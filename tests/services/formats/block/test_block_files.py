@@ -13,15 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from services.errors import FormatError, InputError
-from services.formats.block import writer
-from services.formats.block.check import check_block
-from services.formats.block.document_json import format_block_json, parse_block_json
-from services.formats.block.hilbert import hilbert_order
-from services.formats.block.reader import FolderChips, read_block
-from services.formats.block.writer import write_block
-from services.formats.sensor_models.rpc_text import parse_rpc_text
-from services.types import ControlPoints, Frame, SurfaceHeights, point_chips
+from amers.services.errors import FormatError, InputError
+from amers.services.formats.block import writer
+from amers.services.formats.block.check import check_block
+from amers.services.formats.block.document_json import format_block_json, parse_block_json
+from amers.services.formats.block.hilbert import hilbert_order
+from amers.services.formats.block.reader import FolderChips, read_block
+from amers.services.formats.block.writer import write_block
+from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
+from amers.services.types import ControlPoints, Frame, SurfaceHeights, point_chips
 from tests.factories import MadeBlock, affine_model, control_points, make_block, metadata, noise_chips
 
 rounding = 1e-12

@@ -8,12 +8,12 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from services.formats.block.check import check_block
-from services.formats.block.reader import BlockContents, FolderChips
-from services.formats.block.writer import write_block
-from services.formats.sensor_models.rpc_text import parse_rpc_text
-from services.formats.text_files import read_text
-from services.types import point_chips
+from amers.services.formats.block.check import check_block
+from amers.services.formats.block.reader import BlockContents, FolderChips
+from amers.services.formats.block.writer import write_block
+from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
+from amers.services.formats.text_files import read_text
+from amers.services.types import point_chips
 
 FOLDER = Path(__file__).parents[3] / "golden" / "invented_block"
 MODEL = "models/left_RPC.TXT"

@@ -9,10 +9,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pyproj import Transformer
 from rasterio.io import MemoryFile
 
-from services.formats.block.reader import FolderChips, read_block
-from services.formats.chips.images import format_chip_tiff
-from services.formats.chips.tiff_pages import stream_chips_tiff
-from services.types import point_chips
+from amers.services.formats.block.reader import FolderChips, read_block
+from amers.services.formats.chips.images import format_chip_tiff
+from amers.services.formats.chips.tiff_pages import stream_chips_tiff
+from amers.services.types import point_chips
 from tests.factories import make_block
 
 a_micrometre = 1e-6

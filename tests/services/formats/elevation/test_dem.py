@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import from_origin
 
-from services.errors import CoverageError, FormatError, VerticalDatumError
-from services.formats.elevation.dem import FilledVoids, read_dem
-from services.formats.elevation.geoid import geoid_of_grid
-from services.imagery.source import ArrayImage, Window
-from services.terrain import Terrain
+from amers.services.errors import CoverageError, FormatError, VerticalDatumError
+from amers.services.formats.elevation.dem import FilledVoids, read_dem
+from amers.services.formats.elevation.geoid import geoid_of_grid
+from amers.services.imagery.source import ArrayImage, Window
+from amers.services.terrain import Terrain
 
 a_millimetre = 1e-3
 a_decimetre = 0.1

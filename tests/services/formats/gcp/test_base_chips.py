@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import rasterio
 
-from services.errors import FormatError, InputError
-from services.formats.gcp.base_chips import (
+from amers.services.errors import FormatError, InputError
+from amers.services.formats.gcp.base_chips import (
     ABSENT,
     NO_MAP,
     UNREADABLE,
@@ -17,8 +17,8 @@ from services.formats.gcp.base_chips import (
     open_base_chip,
     read_base_chips,
 )
-from services.imagery.scene import Scene
-from services.imagery.source import Window
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import Window
 from tests.services.chip_bases import (
     base_points,
     brightness,

@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import Transformer
 
-from services.errors import AmersError, FormatError, InputError, VerticalDatumError
-from services.formats.gcp.copernicus import parse_copernicus
-from services.formats.gcp.csv_points import CsvLayout, parse_columns, parse_csv
-from services.formats.gcp.gcplib import parse_gcplib
-from services.formats.gcp.json_formats import parse_geojson_points
-from services.formats.gcp.reader import StatedByCaller, read_control_points, read_ground_points
-from services.types import GroundPoints
+from amers.services.errors import AmersError, FormatError, InputError, VerticalDatumError
+from amers.services.formats.gcp.copernicus import parse_copernicus
+from amers.services.formats.gcp.csv_points import CsvLayout, parse_columns, parse_csv
+from amers.services.formats.gcp.gcplib import parse_gcplib
+from amers.services.formats.gcp.json_formats import parse_geojson_points
+from amers.services.formats.gcp.reader import StatedByCaller, read_control_points, read_ground_points
+from amers.services.types import GroundPoints
 
 GOLDEN = Path(__file__).parents[3] / "golden"
 MAPPED = CsvLayout(

@@ -14,13 +14,18 @@ from hypothesis import strategies as st
 from rasterio.control import GroundControlPoint
 from rasterio.transform import RPCTransformer, from_gcps
 
-from services.errors import AmersError, FormatError, InputError, VerticalDatumError
-from services.formats.gcp.json_formats import format_opf, opf_camera_id, parse_geojson_points, parse_opf
-from services.formats.gcp.marked_points import MarkedPoints, marked_points, parse_crs
-from services.formats.gcp.odm import format_gcp_list, parse_gcp_list
-from services.formats.gcp.pci import format_pci_text, parse_pci_text
-from services.formats.gcp.reader import read_control_points
-from services.formats.gcp.text_formats import (
+from amers.services.errors import AmersError, FormatError, InputError, VerticalDatumError
+from amers.services.formats.gcp.json_formats import (
+    format_opf,
+    opf_camera_id,
+    parse_geojson_points,
+    parse_opf,
+)
+from amers.services.formats.gcp.marked_points import MarkedPoints, marked_points, parse_crs
+from amers.services.formats.gcp.odm import format_gcp_list, parse_gcp_list
+from amers.services.formats.gcp.pci import format_pci_text, parse_pci_text
+from amers.services.formats.gcp.reader import read_control_points
+from amers.services.formats.gcp.text_formats import (
     format_asp_gcp,
     format_envi_pts,
     format_qgis_points,
@@ -28,8 +33,8 @@ from services.formats.gcp.text_formats import (
     parse_envi_pts,
     parse_qgis_points,
 )
-from services.formats.images.raster import gdal_rpc
-from services.formats.sensor_models.rpc_text import parse_rpc_text
+from amers.services.formats.images.raster import gdal_rpc
+from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
 
 GOLDEN = Path(__file__).parents[3] / "golden"
 MODEL = parse_rpc_text((GOLDEN / "invented_RPC.TXT").read_text())

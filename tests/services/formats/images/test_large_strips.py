@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import rasterio
 
-from services.errors import FormatError
-from services.formats.images import working_copy
-from services.formats.images.layout import largest_piece_bytes
-from services.formats.images.masks import apply_mask
-from services.formats.images.raster import RasterImage, open_raster
-from services.imagery.source import Window
+from amers.services.errors import FormatError
+from amers.services.formats.images import working_copy
+from amers.services.formats.images.layout import largest_piece_bytes
+from amers.services.formats.images.masks import apply_mask
+from amers.services.formats.images.raster import RasterImage, open_raster
+from amers.services.imagery.source import Window
 
 LINES, SAMPLES = 300, 400
 ONE_STRIP = {"blockysize": LINES, "compress": "deflate"}

@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
-from services.errors import FormatError
-from services.formats.images.map_tiles import read_map_tile, tile_media_type, write_map_tiles
-from services.imagery.source import Window
-from services.orthorectification.rectify import OrthoWindow
-from services.orthorectification.tile_limits import TILE_PX, TileLimits, TilePlace
-from services.types import FloatImage
+from amers.services.errors import FormatError
+from amers.services.formats.images.map_tiles import read_map_tile, tile_media_type, write_map_tiles
+from amers.services.imagery.source import Window
+from amers.services.orthorectification.rectify import OrthoWindow
+from amers.services.orthorectification.tile_limits import TILE_PX, TileLimits, TilePlace
+from amers.services.types import FloatImage
 
 FINEST = TileLimits(10, first_row=301, last_row=305, first_column=511, last_column=513)
 LEVELS = [FINEST, FINEST.coarser(), FINEST.coarser().coarser()]

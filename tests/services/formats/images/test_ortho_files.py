@@ -9,14 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rasterio.transform import Affine
 
-from services.errors import FormatError
-from services.formats.images.bands import default_mix, parse_bands
-from services.formats.images.ortho import write_refined_ortho
-from services.formats.images.raster import map_grid_of, open_raster
-from services.formats.images.scenes import CE90_TO_SIGMA, model_files, read_scene
-from services.imagery.source import Window
-from services.sensors.correction import CorrectedModel, ImageCorrection
-from services.sensors.ortho import OrthoModel, fold_into_ortho
+from amers.services.errors import FormatError
+from amers.services.formats.images.bands import default_mix, parse_bands
+from amers.services.formats.images.ortho import write_refined_ortho
+from amers.services.formats.images.raster import map_grid_of, open_raster
+from amers.services.formats.images.scenes import CE90_TO_SIGMA, model_files, read_scene
+from amers.services.imagery.source import Window
+from amers.services.sensors.correction import CorrectedModel, ImageCorrection
+from amers.services.sensors.ortho import OrthoModel, fold_into_ortho
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 

@@ -8,10 +8,10 @@ import rasterio
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.errors import FormatError
-from services.formats.images.raster import copy_with_rpc, open_raster, write_raster
-from services.formats.sensor_models.rpc_text import parse_rpc_text
-from services.imagery.source import ArrayImage, Window
+from amers.services.errors import FormatError
+from amers.services.formats.images.raster import copy_with_rpc, open_raster, write_raster
+from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
+from amers.services.imagery.source import ArrayImage, Window
 
 MODEL = parse_rpc_text((Path(__file__).parents[3] / "golden" / "invented_RPC.TXT").read_text())
 PIXELS = np.random.default_rng(5).integers(1, 4000, (90, 120)).astype(np.uint16)

@@ -11,16 +11,16 @@ import rasterio
 import rpcfast
 from rasterio.warp import transform
 
-from services.errors import FormatError
-from services.formats.images.scenes import read_scene
-from services.formats.sensor_models.dimap import format_dimap_rpc, parse_dimap_rpc
-from services.formats.sensor_models.rpc_files import read_rpc
-from services.formats.sensor_models.rpc_text import format_rpc_text, parse_rpc_text
-from services.imagery.scene import Scene, scene_centre, scene_gsd_m
-from services.imagery.source import Window, render_chip
-from services.sensors.correction import fold_into_rpc, no_correction
-from services.sensors.rpc import RpcModel, check_rpc
-from services.types import Array
+from amers.services.errors import FormatError
+from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.sensor_models.dimap import format_dimap_rpc, parse_dimap_rpc
+from amers.services.formats.sensor_models.rpc_files import read_rpc
+from amers.services.formats.sensor_models.rpc_text import format_rpc_text, parse_rpc_text
+from amers.services.imagery.scene import Scene, scene_centre, scene_gsd_m
+from amers.services.imagery.source import Window, render_chip
+from amers.services.sensors.correction import fold_into_rpc, no_correction
+from amers.services.sensors.rpc import RpcModel, check_rpc
+from amers.services.types import Array
 
 pytestmark = [
     pytest.mark.real_data,

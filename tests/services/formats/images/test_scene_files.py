@@ -11,18 +11,18 @@ import pytest
 import rasterio
 from rasterio.transform import Affine
 
-from services.errors import FormatError
-from services.formats.images.raster import gdal_rpc
-from services.formats.images.scenes import prior_sigma_m, read_scene
-from services.formats.sensor_models.dimap import format_dimap_rpc
-from services.formats.sensor_models.geom import format_geom
-from services.formats.sensor_models.rpc_files import read_rpc, write_model
-from services.formats.sensor_models.rpc_text import format_rpb, format_rpc_text, parse_rpc_text
-from services.imagery.scene import scene_centre, scene_gsd_m
-from services.imagery.source import Window
-from services.sensors.correction import fold_into_rpc, no_correction
-from services.sensors.rpc import RpcModel
-from services.types import Array
+from amers.services.errors import FormatError
+from amers.services.formats.images.raster import gdal_rpc
+from amers.services.formats.images.scenes import prior_sigma_m, read_scene
+from amers.services.formats.sensor_models.dimap import format_dimap_rpc
+from amers.services.formats.sensor_models.geom import format_geom
+from amers.services.formats.sensor_models.rpc_files import read_rpc, write_model
+from amers.services.formats.sensor_models.rpc_text import format_rpb, format_rpc_text, parse_rpc_text
+from amers.services.imagery.scene import scene_centre, scene_gsd_m
+from amers.services.imagery.source import Window
+from amers.services.sensors.correction import fold_into_rpc, no_correction
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Array
 
 GOLDEN = Path(__file__).parents[3] / "golden"
 FULL = parse_rpc_text((GOLDEN / "invented_RPC.TXT").read_text())

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from services.formats.images.tiles import TILE_PX, TileIndex, format_tile_index, write_tiles
-from services.imagery.source import ArrayImage, FloatImage
+from amers.services.formats.images.tiles import TILE_PX, TileIndex, format_tile_index, write_tiles
+from amers.services.imagery.source import ArrayImage, FloatImage
 
 the_loss_of_jpeg = 3.0
 most_places_off = 0.01

@@ -6,9 +6,9 @@ from datetime import datetime, timedelta
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from services.sensors.light_path import GEOMETRIC, LightPath
-from services.sensors.pushbroom import PushbroomModel
-from services.simulation.orbit import pushbroom_over
+from amers.services.sensors.light_path import GEOMETRIC, LightPath
+from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.simulation.orbit import pushbroom_over
 
 SHAPE = (4000, 3000)
 _MIDDLE = datetime(2021, 6, 3, 10, 20, 30, 250000)

@@ -10,16 +10,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.errors import FormatError
-from services.formats.sensor_models.dimap import (
+from amers.services.errors import FormatError
+from amers.services.formats.sensor_models.dimap import (
     format_dimap_rpc,
     parse_dimap_acquisition,
     parse_dimap_rpc,
 )
-from services.formats.sensor_models.rpc_text import parse_rpc_text
-from services.sensors.correction import ImageCorrection, fold_into_rpc, no_correction
-from services.sensors.rpc import RpcModel, cubic_terms
-from services.types import Array
+from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
+from amers.services.sensors.correction import ImageCorrection, fold_into_rpc, no_correction
+from amers.services.sensors.rpc import RpcModel, cubic_terms
+from amers.services.types import Array
 
 GOLDEN = Path(__file__).parents[3] / "golden"
 V2 = (GOLDEN / "RPC_invented_v2.XML").read_text()
@@ -130,7 +130,7 @@ def test_a_model_that_mixes_lines_and_samples_is_written_in_both_directions(text
 
 @both_versions
 def test_a_contradictory_model_to_the_ground_is_removed(text: str, monkeypatch) -> None:
-    monkeypatch.setattr("services.formats.sensor_models.dimap.TO_GROUND_LIMIT_PX", 0.0)
+    monkeypatch.setattr("amers.services.formats.sensor_models.dimap.TO_GROUND_LIMIT_PX", 0.0)
     mixed = replace(MODEL, line_num=MODEL.line_num + 1e-3 * MODEL.sample_num)
     written = format_dimap_rpc(text, mixed)
     assert misfit_px(parse_dimap_rpc(written), mixed) == 0.0

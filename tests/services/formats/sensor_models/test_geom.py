@@ -11,18 +11,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.errors import FormatError
-from services.formats.images.scenes import read_scene
-from services.formats.sensor_models.geom import (
+from amers.services.errors import FormatError
+from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.sensor_models.geom import (
     format_geom,
     is_geom,
     parse_geom,
     parse_geom_acquisition,
 )
-from services.formats.sensor_models.rpc_files import read_rpc
-from services.formats.sensor_models.rpc_text import parse_rpc_text
-from services.sensors.rpc import RpcModel
-from services.types import Array
+from amers.services.formats.sensor_models.rpc_files import read_rpc
+from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
+from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Array
 
 GOLDEN = Path(__file__).parents[3] / "golden"
 MODEL = parse_rpc_text((GOLDEN / "invented_RPC.TXT").read_text())

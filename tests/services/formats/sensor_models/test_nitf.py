@@ -9,12 +9,12 @@ import pytest
 import rasterio
 from rasterio.transform import RPCTransformer
 
-from services.errors import FormatError
-from services.formats.images.raster import open_raster
-from services.formats.images.scenes import read_scene
-from services.formats.sensor_models.rpc_files import read_rpc
-from services.imagery.source import Window
-from services.sensors.rpc import RpcModel
+from amers.services.errors import FormatError
+from amers.services.formats.images.raster import open_raster
+from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.sensor_models.rpc_files import read_rpc
+from amers.services.imagery.source import Window
+from amers.services.sensors.rpc import RpcModel
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from amers.services.adjustment.rigorous_parameters import rigorous_parameters
+from amers.services.formats.sensor_models.rigorous_model import read_rigorous_model
+from amers.services.sensors.parameter_sets import TOUTIN
 from benchmarks import _rigorous_oracles as oracles
-from services.adjustment.rigorous_parameters import rigorous_parameters
-from services.formats.sensor_models.rigorous_model import read_rigorous_model
-from services.sensors.parameter_sets import TOUTIN
 
 pytestmark = [pytest.mark.real_data, pytest.mark.thorough]
 

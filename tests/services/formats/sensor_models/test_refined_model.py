@@ -13,20 +13,20 @@ import rasterio
 import shapely
 from rasterio.transform import Affine
 
-from services.errors import FormatError
-from services.formats.images.scenes import read_scene
-from services.formats.sensor_models.correction_json import (
+from amers.services.errors import FormatError
+from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.sensor_models.correction_json import (
     format_correction,
     parse_correction,
     parse_correction_accuracy,
 )
-from services.formats.sensor_models.refined_model import write_refined
-from services.formats.vector.residual_layers import exaggeration_for, write_residual_layers
-from services.geodesy import metres_per_degree_at
-from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
-from services.sensors.displacement import DisplacementGrid
-from services.sensors.refined import REFIT_LIMIT_PX, refined_rpc
-from services.simulation.orbit import pushbroom_over
+from amers.services.formats.sensor_models.refined_model import write_refined
+from amers.services.formats.vector.residual_layers import exaggeration_for, write_residual_layers
+from amers.services.geodesy import metres_per_degree_at
+from amers.services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
+from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.sensors.refined import REFIT_LIMIT_PX, refined_rpc
+from amers.services.simulation.orbit import pushbroom_over
 
 A_MICROMETRE = 1e-6
 CORRECTION = ImageCorrection(

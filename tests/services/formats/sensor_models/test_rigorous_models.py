@@ -9,15 +9,15 @@ import pytest
 import rasterio
 from scipy.spatial.transform import Rotation
 
-from services.errors import FormatError
-from services.formats.sensor_models.dimap_rigorous import parse_dimap_rigorous
-from services.formats.sensor_models.phr_dimap import parse_phr_dimap
-from services.formats.sensor_models.rigorous_model import read_rigorous_model
-from services.formats.sensor_models.rpc_files import read_rpc, write_model
-from services.formats.sensor_models.spot_dimap import parse_spot_dimap
-from services.formats.sensor_models.worldview_isd import parse_worldview_isd
-from services.sensors.light_path import GEOMETRIC, LightPath
-from services.sensors.pushbroom import PushbroomModel
+from amers.services.errors import FormatError
+from amers.services.formats.sensor_models.dimap_rigorous import parse_dimap_rigorous
+from amers.services.formats.sensor_models.phr_dimap import parse_phr_dimap
+from amers.services.formats.sensor_models.rigorous_model import read_rigorous_model
+from amers.services.formats.sensor_models.rpc_files import read_rpc, write_model
+from amers.services.formats.sensor_models.spot_dimap import parse_spot_dimap
+from amers.services.formats.sensor_models.worldview_isd import parse_worldview_isd
+from amers.services.sensors.light_path import GEOMETRIC, LightPath
+from amers.services.sensors.pushbroom import PushbroomModel
 from tests.services.formats.sensor_models import simulated_metadata as simulated
 
 ALL = LightPath(velocity_aberration=True, light_time=True, refraction=True)

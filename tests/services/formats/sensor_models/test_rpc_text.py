@@ -10,16 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from services.errors import FormatError
-from services.formats.sensor_models.rpc_text import (
+from amers.services.errors import FormatError
+from amers.services.formats.sensor_models.rpc_text import (
     format_rpb,
     format_rpc_text,
     parse_rpb,
     parse_rpc_text,
     rpb_satellite,
 )
-from services.formats.text_files import parse_number
-from services.sensors.rpc import RpcModel
+from amers.services.formats.text_files import parse_number
+from amers.services.sensors.rpc import RpcModel
 
 TEXT = (Path(__file__).parents[3] / "golden" / "invented_RPC.TXT").read_text()
 RPB = (Path(__file__).parents[3] / "golden" / "invented.RPB").read_text()

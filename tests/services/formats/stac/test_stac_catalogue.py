@@ -13,9 +13,9 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.errors import FormatError
-from services.formats.stac.catalogue import parse_mask, read_catalogue
-from services.formats.stac.items import parse_item
+from amers.services.errors import FormatError
+from amers.services.formats.stac.catalogue import parse_mask, read_catalogue
+from amers.services.formats.stac.items import parse_item
 
 SQUARE = {"type": "Polygon", "coordinates": [[[10, 0], [11, 0], [11, 1], [10, 1], [10, 0]]]}
 
