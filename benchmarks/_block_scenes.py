@@ -4,9 +4,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from amers.services.adjustment.bundle import BlockAdjustment
-from amers.services.adjustment.control_observations import ControlObservations
-from amers.services.adjustment.image_correction import adjust_scene
 from amers.services.geodesy import move_metres
+from amers.services.misfit.control_observations import ControlObservations
+from amers.services.misfit.image_correction import adjust_scene
 from amers.services.quality.stability import image_places
 from amers.services.sensors.correction import ImageCorrection
 from amers.services.simulation.view import ViewGeometry

@@ -49,6 +49,7 @@ def _of_service(name: str, sources: str, tests: str) -> Module:
 MODULES = (
     _of_science("quality"),
     _of_science("adjustment"),
+    _of_science("misfit"),
     _of_science("matching"),
     _of_science("sensors"),
     _of_science("registration"),

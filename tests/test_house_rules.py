@@ -29,7 +29,7 @@ TOUR = (
     "app/usecases/registration/register.py",
     "services/registration/on_points.py",
     "services/matching/correlate.py",
-    "services/adjustment/image_correction.py",
+    "services/misfit/image_correction.py",
     "services/sensors/rpc.py",
 )
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("*/README.md")])

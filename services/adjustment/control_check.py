@@ -8,8 +8,8 @@ from amers.services.adjustment.block_accuracy import BlockAccuracy
 from amers.services.adjustment.block_problem import BlockProblem
 from amers.services.adjustment.block_solution import State
 from amers.services.adjustment.normal_equations import Equations, Pairs, Points, eliminated, pair_row
-from amers.services.adjustment.robust import CAUCHY_TUNING
 from amers.services.errors import InputError
+from amers.services.misfit.robust import CAUCHY_TUNING
 from amers.services.types import Array, BoolArray, IntArray
 
 _AGREES = 0.9999

@@ -7,9 +7,9 @@ from scipy.special import chdtri
 
 from amers.services.adjustment.control_ground import ControlGround
 from amers.services.adjustment.parameters import frame_weight
-from amers.services.adjustment.robust import CAUCHY_TUNING
 from amers.services.errors import NoConsensus
 from amers.services.geodesy import metres_per_degree_at
+from amers.services.misfit.robust import CAUCHY_TUNING
 from amers.services.types import Array, BoolArray, Frame
 
 _AGREES = 0.9999

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from amers.services.adjustment.robust import CAUCHY_TUNING
+from amers.services.misfit.robust import CAUCHY_TUNING
 from amers.services.types import Array, IntArray
 
 _SINGULAR = 1e-13

@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy import sparse
 
-from amers.services.adjustment.affine_fit import FREE, Order
+from amers.services.misfit.affine_fit import FREE, Order
 from amers.services.sensors.base import SensorModel
 from amers.services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
 from amers.services.sensors.displacement import DisplacementGrid

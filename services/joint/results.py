@@ -5,21 +5,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from amers.services.adjustment.control_observations import declared_fit
-from amers.services.adjustment.image_correction import SceneAdjustment, deformation_covariance
 from amers.services.adjustment.parameter_figures import (
     ParameterFigure,
     held_parameters,
     parameter_figures,
 )
-from amers.services.adjustment.placed_measures import PlacedMeasures
 from amers.services.adjustment.rigorous_parameters import RigorousParameters
-from amers.services.adjustment.shared_errors import SharedErrors
-from amers.services.adjustment.short_motion import STILL
 from amers.services.conventions import CHIP_SIZE
 from amers.services.imagery.scene import scene_gsd_m
 from amers.services.joint.block import JointBlock
 from amers.services.joint.nearest import nearest_correction, scene_heights_m
+from amers.services.misfit.control_observations import declared_fit
+from amers.services.misfit.image_correction import SceneAdjustment, deformation_covariance
+from amers.services.misfit.placed_measures import PlacedMeasures
+from amers.services.misfit.shared_errors import SharedErrors
+from amers.services.misfit.short_motion import STILL
 from amers.services.quality.cell_stability import cell_stability_of, cells_of
 from amers.services.quality.frames import shared_frame, weighted_frame
 from amers.services.quality.qualification import QualificationOptions, qualify_repeated

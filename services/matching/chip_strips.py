@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from amers.services.adjustment.short_motion import STRIPS, ChipStrips
 from amers.services.matching.least_squares_kernels import CELL_PX
 from amers.services.matching.view_combination import ViewCombination
+from amers.services.misfit.short_motion import STRIPS, ChipStrips
 from amers.services.types import Array
 
 _LEAST_LEVERAGE = 0.01

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from amers.services.adjustment.short_motion import ChipStrips
 from amers.services.conventions import CHIP_CENTRE
 from amers.services.geodesy import move_metres
 from amers.services.imagery.gaps import bridged, missing_reason
@@ -38,6 +37,7 @@ from amers.services.matching.view_combination import (
     no_measure,
 )
 from amers.services.matching.view_selection import ViewDistanceScales, select_views
+from amers.services.misfit.short_motion import ChipStrips
 from amers.services.sensors.base import SensorModel
 from amers.services.types import (
     Acquisition,

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from amers.services.adjustment.robust import MAD_TO_STD
 from amers.services.matching.shadows import shadow_vector
+from amers.services.misfit.robust import MAD_TO_STD
 from amers.services.types import Acquisition, Array, IntArray, Views
 
 COMMON_SIGMA_PX = 0.035

@@ -9,9 +9,9 @@ import shapely
 from scipy.spatial import KDTree
 from scipy.special import comb
 
-from amers.services.adjustment.broken_image import FEWEST_IN_PART, held_parts, part_of_line
-from amers.services.adjustment.structure import Family, Structure
 from amers.services.imagery.line_breaks import format_breaks
+from amers.services.misfit.broken_image import FEWEST_IN_PART, held_parts, part_of_line
+from amers.services.misfit.structure import Family, Structure
 from amers.services.quality.criteria import Criterion, Grade, at_most
 from amers.services.quality.missed_along import UNFOUND, missed_along, missed_at_borders
 from amers.services.types import Array, BoolArray, IntArray

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import KDTree
 
-from amers.services.adjustment.broken_image import on_one_side
 from amers.services.conventions import CHIP_SIZE
 from amers.services.matching.consensus import a_contrario_consensus, consensus_tolerance_px
+from amers.services.misfit.broken_image import on_one_side
 from amers.services.quality.accuracy import Statistics, statistics
 from amers.services.quality.accuracy_statement import AccuracyStatement, scene_accuracy
 from amers.services.quality.cell_stability import CellStability, measure_cell_stability

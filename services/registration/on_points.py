@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from amers.services.adjustment.image_correction import SceneAdjustment
 from amers.services.conventions import CHIP_SIZE
 from amers.services.errors import (
     ComputationError,
@@ -18,6 +17,7 @@ from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import CachedImage
 from amers.services.matching.consensus import Voters
 from amers.services.matching.control_points import ChipSearch, match_points
+from amers.services.misfit.image_correction import SceneAdjustment
 from amers.services.quality.frames import shared_frame
 from amers.services.quality.lack_of_fit import Elsewhere
 from amers.services.quality.qualification import Qualification, qualify

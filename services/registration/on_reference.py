@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from amers.services.adjustment.image_correction import SceneAdjustment
 from amers.services.conventions import CHIP_SIZE, MAX_ERROR_SIGMAS
 from amers.services.errors import ComputationError, CoverageError, NoConsensus
 from amers.services.imagery.line_breaks import scene_breaks
@@ -25,6 +24,7 @@ from amers.services.matching.reference_image import (
     match_places,
     visible_places,
 )
+from amers.services.misfit.image_correction import SceneAdjustment
 from amers.services.quality.stability import image_places
 from amers.services.registration.broken import naming_breaks
 from amers.services.registration.context import (

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from amers.services.adjustment.image_correction import SceneAdjustment
 from amers.services.imagery.scene import Scene
+from amers.services.misfit.image_correction import SceneAdjustment
 from amers.services.registration.search import Search
 from amers.services.sensors.correction import CorrectedModel
 from amers.services.types import Array, ControlPoints, Measures

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from amers.services.adjustment.control_observations import ControlObservations
-from amers.services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
 from amers.services.conventions import MAX_ERROR_SIGMAS
 from amers.services.errors import NoConsensus, NotEnoughPoints
 from amers.services.geodesy import continuous, ecef_from_east_north_up
@@ -23,6 +21,8 @@ from amers.services.matching.consensus import (
     robust_affine_inliers,
 )
 from amers.services.matching.control_points import PointMatches
+from amers.services.misfit.control_observations import ControlObservations
+from amers.services.misfit.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
 from amers.services.quality.frames import shared_frame
 from amers.services.registration.context import Candidate, NotFound, Prediction, SearchStage
 from amers.services.sensors.base import SensorModel

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amers.services.adjustment.image_correction import SceneAdjustment
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import reduce_image, render_chip
+from amers.services.misfit.image_correction import SceneAdjustment
 from amers.services.registration.on_points import Registration
 from amers.services.sensors.displacement import DisplacementGrid
 from amers.services.types import (

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from amers.services.adjustment.image_correction import SceneAdjustment
 from amers.services.formats.images.ortho import write_refined_ortho
 from amers.services.formats.images.raster import open_raster
 from amers.services.formats.sensor_models.attitude_csv import ATTITUDE_CSV, format_attitude
@@ -16,6 +15,7 @@ from amers.services.formats.sensor_models.rpc_files import (
     write_model,
 )
 from amers.services.map_grid import MapGrid
+from amers.services.misfit.image_correction import SceneAdjustment
 from amers.services.sensors.base import SensorModel
 from amers.services.sensors.correction import CorrectedModel
 from amers.services.sensors.moving_pushbroom import AttitudeMotion

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, f
 
-from amers.services.adjustment.affine_fit import ORDERS, Order
 from amers.services.adjustment.block_problem import BlockOptions
 from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
 from amers.services.adjustment.intersection import intersect
 from amers.services.adjustment.parameters import image_parameters
 from amers.services.errors import NoConvergence, NotEnoughPoints
+from amers.services.misfit.affine_fit import ORDERS, Order
 from amers.services.sensors.correction import CorrectedModel
 from amers.services.sensors.displacement import DisplacementGrid
 from amers.services.simulation.view import ViewGeometry

@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from amers.services.adjustment.short_motion import STRIPS, ChipStrips
 from amers.services.conventions import CHIP_SIZE
 from amers.services.matching.chip_strips import chip_strips
 from amers.services.matching.correlate import CorrelationOptions, find_chip
 from amers.services.matching.view_combination import combine_views, no_measure
+from amers.services.misfit.short_motion import STRIPS, ChipStrips
 from amers.services.types import Array, FloatImage
 
 RADIUS = 6

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from amers.services.adjustment.displacement_components import Component
+from amers.services.misfit.displacement_components import Component
 from amers.services.quality.criteria import Criterion
 from amers.services.quality.lack_of_fit import correction_against_height
 from amers.services.quality.qualification import QualificationOptions, qualify

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from amers.services.adjustment.structure import Family, Structure, unfollowed_variance_px2
+from amers.services.misfit.structure import Family, Structure, unfollowed_variance_px2
 from amers.services.quality.criteria import Criterion
 from amers.services.quality.lack_of_fit import breaks_criterion, structure_criteria
 

@@ -5,11 +5,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from amers.services.adjustment.image_correction import AdjustmentOptions
 from amers.services.conventions import CHIP_SIZE
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage, CachedImage, Window
 from amers.services.matching.control_points import ChipSearch, PointMatches, match_points
+from amers.services.misfit.image_correction import AdjustmentOptions
 from amers.services.quality.lack_of_fit import Elsewhere
 from amers.services.registration.context import PointContext
 from amers.services.registration.elsewhere import adjust_with_places

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from amers.services.adjustment.control_observations import ControlObservations
-from amers.services.adjustment.image_correction import AdjustmentOptions, adjust_scene
 from amers.services.geodesy import ecef_from_lon_lat_h, metres_per_degree_at
 from amers.services.imagery.scene import view_direction
 from amers.services.map_grid import MapGrid
+from amers.services.misfit.control_observations import ControlObservations
+from amers.services.misfit.image_correction import AdjustmentOptions, adjust_scene
 from amers.services.sensors.correction import CorrectedModel, ImageCorrection
 from amers.services.sensors.ortho import OrthoModel, ReliefDisplacement, fold_into_ortho
 
