@@ -1,0 +1,1 @@
+"""The entry points and the store, around the science of `amers.services`."""

@@ -1,4 +1,4 @@
-"""What holds the house together: imports, the tour, and documents that name everything there is."""
+"""What holds the house together: imports, and documents that name everything there is."""
 
 import ast
 import os
@@ -24,14 +24,6 @@ from tests.composed_sql import Source, read_sources
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
 OPERATIONS = ROOT / "docs" / "operations.md"
-TOUR = (
-    "app/api/scenes.py",
-    "app/usecases/registration/register.py",
-    "services/registration/on_points.py",
-    "services/matching/correlate.py",
-    "services/misfit/image_correction.py",
-    "services/sensors/rpc.py",
-)
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("*/README.md")])
 FOLDERS = "app|services|migrations|tests|docs|examples|benchmarks|scripts|web|qgis_plugin"
 OLD_WORDS = (
@@ -121,12 +113,6 @@ def test_a_module_of_tests_states_its_marks_once():
     """A second list would replace the first, and its tests be run against their marks."""
     for path in (ROOT / "tests").rglob("test_*.py"):
         assert len(re.findall(r"^pytestmark\b", path.read_text(), re.MULTILINE)) <= 1, path
-
-
-@pytest.mark.parametrize("path", TOUR)
-def test_a_stop_of_the_tour_exists_and_the_readme_leads_to_it(path):
-    assert (ROOT / path).is_file()
-    assert f"`{path}`" in README.read_text()
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))

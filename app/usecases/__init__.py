@@ -1,1 +1,1 @@
-"""What a user can ask for: one function each, shared by the API, the command line and the worker."""
+"""What a user can request: one function each, shared by the API, the command line and the worker."""

@@ -1,0 +1,1 @@
+"""The worker: it takes jobs from the queue and runs each attempt in a process of its own."""

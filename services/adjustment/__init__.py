@@ -1,0 +1,1 @@
+"""The adjustment of many images: a block with its tie points and its control."""

@@ -1,0 +1,1 @@
+"""Scenes registered together in one adjustment."""

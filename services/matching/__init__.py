@@ -1,0 +1,1 @@
+"""Positions of chips in images, and points that several images show."""

@@ -1,0 +1,1 @@
+"""Scenes resampled onto a map through their sensor model and a terrain."""

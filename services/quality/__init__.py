@@ -1,0 +1,1 @@
+"""How good a registration or a block is: figures, criteria and verdicts."""

@@ -1,0 +1,1 @@
+"""The registration of one scene, on control points or on a reference image."""

@@ -1,0 +1,1 @@
+"""Reports as documents, tables, figures and pages."""

@@ -1,0 +1,1 @@
+"""Vectors digitised on a raw scene, brought onto the map, and map vectors brought into the scene."""

@@ -1,0 +1,1 @@
+"""Queries of points, blocks and scenes: filters, pages, counts and serialisation."""

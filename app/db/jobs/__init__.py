@@ -1,0 +1,1 @@
+"""Jobs, their attempts and their queue in the database."""

@@ -1,0 +1,1 @@
+"""Backups of database and stored files, made, verified and restored."""

@@ -1,0 +1,1 @@
+"""Blocks in the store: ingestion, publication, export, quality and renewal."""

@@ -1,0 +1,1 @@
+"""Requests for points, blocks and scenes, and their replies."""

@@ -1,0 +1,1 @@
+"""Registrations of one scene or of several, with their control and their outputs."""
