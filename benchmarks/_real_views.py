@@ -13,7 +13,7 @@ from amers.services.formats.images.scenes import read_scene
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage, Window
 from amers.services.matching.ground_features import FeatureOptions
-from amers.services.production.from_images import Production, ProductionOptions, produce_points
+from amers.services.production.image_production import Production, ProductionOptions, produce_points
 from amers.services.sensors.base import SensorModel
 from amers.services.sensors.rpc import RpcModel
 from amers.services.types import Array, BoolArray, ControlPoints, Observations, Views

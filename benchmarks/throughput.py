@@ -25,8 +25,8 @@ from typing import Any
 import httpx
 import numpy as np
 
-from amers.app.usecases.image_production import ProductionImages, run_production
-from amers.app.usecases.production import BlockIdentity
+from amers.app.usecases.image_production import ProductionImages, run_image_production
+from amers.app.usecases.new_block import BlockIdentity
 from amers.app.usecases.registration import deliverables, register
 from amers.app.usecases.registration.control_sources import points_of_block
 from amers.app.usecases.registration.register import ControlSources, SceneFiles, run_registration
@@ -90,7 +90,7 @@ def make_scenes(folder: Path, count: int) -> list[Path]:
         sources.append(folder / "images" / f"{view.geometry.plan.image_id}.tif")
         write_raster(sources[-1], view.pixels, view.geometry.delivered)
     identity = BlockIdentity("throughput", title="Simulated", license="CC0-1.0")
-    run_production(ProductionImages(tuple(sources), sigma_m=4.0), folder / "block", identity)
+    run_image_production(ProductionImages(tuple(sources), sigma_m=4.0), folder / "block", identity)
     lon, lat = (float(value) for value in world.centre_lon_lat)
     skew_px = np.array([[0.0, 0.0, SKEW_PX], [0.0, SKEW_PX, 0.0]])
     images = []

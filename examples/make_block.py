@@ -12,10 +12,10 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import simulated_images
 
-from amers.app.usecases.image_production import ProductionImages, run_production
-from amers.app.usecases.production import BlockIdentity
+from amers.app.usecases.image_production import ProductionImages, run_image_production
+from amers.app.usecases.new_block import BlockIdentity
 from amers.services.formats.block.reader import FolderChips, read_block
-from amers.services.production.from_images import ProductionOptions
+from amers.services.production.image_production import ProductionOptions
 from amers.services.types import point_chips
 
 
@@ -26,7 +26,9 @@ def make_block(images: list[Path], folder: Path) -> None:
     identity = BlockIdentity("example", title="A block of the examples", license="CC0-1.0")
 
     # `sigma_m` states how wrong the models of the images may be: one standard deviation per coordinate.
-    production = run_production(ProductionImages(tuple(images), sigma_m=3.0), folder, identity, options)
+    production = run_image_production(
+        ProductionImages(tuple(images), sigma_m=3.0), folder, identity, options
+    )
 
     accuracy = production.relative_accuracy
     print(f"{len(production.points)} points in {folder}")

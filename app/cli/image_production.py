@@ -16,11 +16,11 @@ from amers.app.cli.progress import shown_progress
 from amers.app.errors import InputError
 from amers.app.usecases.executors import ComputeOptions
 from amers.app.usecases.ground_classes import GroundFiles
-from amers.app.usecases.image_production import ProductionImages, WorkPlace, run_production
+from amers.app.usecases.image_production import ProductionImages, WorkPlace, run_image_production
 from amers.app.usecases.image_selection import CatalogueRequest, run_selection
-from amers.app.usecases.production import BlockIdentity, refuse_existing
+from amers.app.usecases.new_block import BlockIdentity, refuse_existing
 from amers.services.formats.addresses import file_place
-from amers.services.production.from_images import ProductionOptions
+from amers.services.production.image_production import ProductionOptions
 from amers.services.reports.block_adjustment_pages import adjustment_table
 from amers.services.types import part_of
 
@@ -168,7 +168,7 @@ def run(
             first_day = None if since is None else since.replace(tzinfo=UTC)
             request = CatalogueRequest(catalogue, area, first_day)
             run_selection(request, selection, progress=part_of(progress, 0.0, _SHARE_OF_SELECTION))
-        production = run_production(
+        production = run_image_production(
             ProductionImages(
                 tuple(map(file_place, images or ())),
                 selection,

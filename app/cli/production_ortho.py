@@ -8,10 +8,11 @@ import typer
 from amers.app.cli.output import AsJson, show_one
 from amers.app.cli.production_rows import accuracy_row, agreement_row, sampling_pair
 from amers.app.cli.progress import shown_progress
-from amers.app.usecases.production import BlockIdentity, OrthoFiles, run_ortho_production
+from amers.app.usecases.new_block import BlockIdentity
+from amers.app.usecases.ortho_production import OrthoFiles, run_ortho_production
 from amers.app.usecases.terrain_file import TerrainFile
-from amers.services.production.from_images import ProductionOptions
-from amers.services.production.from_ortho import OrthoPointOptions
+from amers.services.production.image_production import ProductionOptions
+from amers.services.production.ortho_production import OrthoPointOptions
 
 _DEFAULT = ProductionOptions()
 _ORTHO_DEFAULT = OrthoPointOptions()

@@ -9,12 +9,12 @@ from amers.app.cli.output import AsJson, show_one
 from amers.app.cli.point_statements import sigma_pair, stated_by_caller
 from amers.app.cli.production_rows import accuracy_row, agreement_row, sampling_pair
 from amers.app.cli.progress import shown_progress
+from amers.app.usecases.new_block import BlockIdentity
 from amers.app.usecases.points_production import KnownPointFiles, run_points_production
-from amers.app.usecases.production import BlockIdentity
 from amers.app.usecases.terrain_file import TerrainFile
 from amers.services.formats.gcp.csv_points import PIXEL_ORIGINS
 from amers.services.formats.gcp.text_formats import ECEF, LAT_LON_HEIGHT
-from amers.services.production.from_points import KnownPointOptions
+from amers.services.production.points_production import KnownPointOptions
 
 _DEFAULT = KnownPointOptions()
 

@@ -10,8 +10,8 @@ from amers.app.config import Settings
 from amers.app.db import engine
 from amers.app.usecases import storage_identity
 from amers.app.usecases.blocks import lifecycle
-from amers.app.usecases.image_production import ProductionImages, run_production
-from amers.app.usecases.production import BlockIdentity
+from amers.app.usecases.image_production import ProductionImages, run_image_production
+from amers.app.usecases.new_block import BlockIdentity
 from amers.app.usecases.registration.control_sources import points_of_store
 from amers.app.usecases.registration.register import (
     ControlSources,
@@ -24,7 +24,7 @@ from amers.app.usecases.registration.result_folder import replacing
 from amers.services.adjustment.intersection import intersect
 from amers.services.formats.images.raster import write_raster
 from amers.services.geodesy import east_north_up, lon_lat_h_from_east_north_up
-from amers.services.production.from_images import Production, ProductionOptions
+from amers.services.production.image_production import Production, ProductionOptions
 from amers.services.quality.accuracy import Quantile, sample_quantile
 from amers.services.registration.on_points import Registration
 from amers.services.simulation.view import (
@@ -130,7 +130,7 @@ def run_demo(folder: Path, settings: Settings, options: DemoOptions, progress: P
     images = [_write_image(view, folder / "images") for view in truth.sources]
     image = _write_image(truth.scene, folder / "images")
 
-    production = run_production(
+    production = run_image_production(
         ProductionImages(tuple(images), sigma_m=options.block_error_m),
         folder / "block",
         BlockIdentity("demo", title="Demonstration on a simulated world", license="CC0-1.0"),

@@ -16,7 +16,7 @@ from amers.app.usecases.control_files import IMAGES_NPZ, ControlFiles, control_i
 from amers.app.usecases.executors import ComputeOptions, open_executor
 from amers.app.usecases.ground_classes import GroundFiles, read_ground
 from amers.app.usecases.image_selection import ITEMS
-from amers.app.usecases.production import BlockIdentity, block_metadata, points_per_km2, refuse_existing
+from amers.app.usecases.new_block import BlockIdentity, block_metadata, points_per_km2, refuse_existing
 from amers.app.usecases.registration.result_folder import replacing
 from amers.services.adjustment.known_images import KnownImages
 from amers.services.errors import FormatError
@@ -29,7 +29,7 @@ from amers.services.formats.stac.catalogue import read_catalogue
 from amers.services.formats.stac.scenes import image_place, read_item_scene
 from amers.services.formats.work_folder import WorkFolder
 from amers.services.imagery.scene import Scene
-from amers.services.production.from_images import Production, ProductionOptions, produce_points
+from amers.services.production.image_production import Production, ProductionOptions, produce_points
 from amers.services.reports.block_adjustment import adjustment_document, adjustment_report, points_csv
 from amers.services.reports.block_adjustment_pages import format_adjustment_html
 from amers.services.sensors.refined import refined_rpc
@@ -71,7 +71,7 @@ class WorkPlace:
     compute: ComputeOptions = field(default_factory=ComputeOptions)
 
 
-def run_production(
+def run_image_production(
     images: ProductionImages,
     folder: Path,
     identity: BlockIdentity,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from amers.app.errors import InputError
-from amers.app.usecases.production import (
+from amers.app.usecases.new_block import (
     BlockIdentity,
     block_metadata,
     fewest_views,
@@ -23,8 +23,12 @@ from amers.services.formats.gcp.base_chips import open_base_chip, read_base_chip
 from amers.services.formats.gcp.reader import StatedByCaller, read_ground_points
 from amers.services.formats.images.bands import parse_bands
 from amers.services.formats.images.scenes import read_scene
-from amers.services.production.from_chips import OwnChips, produce_points_with_chips
-from amers.services.production.from_points import KnownPointOptions, KnownPoints, produce_known_points
+from amers.services.production.points_production import (
+    KnownPointOptions,
+    KnownPoints,
+    produce_known_points,
+)
+from amers.services.production.points_with_chips import OwnChips, produce_points_with_chips
 from amers.services.sensors.rpc import RpcModel
 from amers.services.types import Frame, GroundPoints, Progress, no_progress, part_of
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from amers.services.production.block_residuals import FITS, ImageFit, PointFits
-from amers.services.production.from_images import Production
+from amers.services.production.image_production import Production
 from amers.services.quality.accuracy_statement import AccuracyStatement, accuracy_document
 from amers.services.quality.block import produced_accuracy
 from amers.services.types import Array

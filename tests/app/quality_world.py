@@ -7,8 +7,9 @@ import numpy as np
 import rasterio
 from rasterio.transform import from_origin
 
-from amers.app.usecases.production import BlockIdentity, OrthoFiles, run_ortho_production
-from amers.services.production.from_ortho import OrthoPointOptions
+from amers.app.usecases.new_block import BlockIdentity
+from amers.app.usecases.ortho_production import OrthoFiles, run_ortho_production
+from amers.services.production.ortho_production import OrthoPointOptions
 from amers.services.types import Array
 from tests.services.textures import moved, texture
 

@@ -20,14 +20,14 @@ from amers.app.db.points import control_points
 from amers.app.db.scenes import set_footprint
 from amers.app.storage import Storage
 from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
-from amers.app.usecases.image_production import ProductionImages, run_production
-from amers.app.usecases.production import BlockIdentity
+from amers.app.usecases.image_production import ProductionImages, run_image_production
+from amers.app.usecases.new_block import BlockIdentity
 from amers.app.usecases.registration.control_sources import points_of_store
 from amers.app.usecases.registration.register import ControlSources, SceneFiles, run_registration
 from amers.services.formats.block.check import check_block
 from amers.services.formats.images.raster import write_raster
 from amers.services.imagery.scene import scene_footprint
-from amers.services.production.from_images import ProductionOptions
+from amers.services.production.image_production import ProductionOptions
 from amers.services.simulation.view import SimulatedView, ViewPlan, simulate_block, simulate_view
 from amers.services.simulation.world import World, make_world
 
@@ -84,7 +84,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     images = [as_file(view, folder) for view in views]
     options = ProductionOptions(fine_gsd_m=1.0, coarse_gsd_m=2.0, points=60)
     delivered = ProductionImages(tuple(images), sigma_m=BLOCK_SIGMA_M)
-    run_production(delivered, folder / "dateline", BlockIdentity("dateline"), options)
+    run_image_production(delivered, folder / "dateline", BlockIdentity("dateline"), options)
     return Made(folder / "dateline", as_file(later_view(), folder))
 
 

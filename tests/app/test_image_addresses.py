@@ -20,9 +20,14 @@ import rasterio.shutil
 from obstore.store import S3Store
 
 from amers.app.usecases.executors import ComputeOptions
-from amers.app.usecases.image_production import ProductionImages, WorkPlace, _file_facts, run_production
+from amers.app.usecases.image_production import (
+    ProductionImages,
+    WorkPlace,
+    _file_facts,
+    run_image_production,
+)
 from amers.app.usecases.image_selection import CatalogueRequest, run_selection
-from amers.app.usecases.production import BlockIdentity
+from amers.app.usecases.new_block import BlockIdentity
 from amers.services.errors import FormatError
 from amers.services.formats import addresses
 from amers.services.formats.addresses import BLOCK_BYTES, Address, file_place
@@ -363,7 +368,9 @@ def test_a_cluster_makes_the_same_block_from_a_bucket_bit_for_bit(bucket, tmp_pa
                 for file in images.iterdir():
                     file.unlink()
             given = ProductionImages(selection=selection, sigma_m=BLOCK_SIGMA_M)
-            run_production(given, tmp_path / name / "block", BlockIdentity("made"), OPTIONS, place=place)
+            run_image_production(
+                given, tmp_path / name / "block", BlockIdentity("made"), OPTIONS, place=place
+            )
             made[name] = content(tmp_path / name / "block")
     assert made["bucket"] == made["files"]
     told = [file.read_bytes() for file in (tmp_path / "bucket").rglob("*.json")]

@@ -9,15 +9,15 @@ import pytest
 
 from amers.app.errors import InputError
 from amers.app.usecases.control_files import IMAGES_NPZ, ControlFiles, control_inputs
-from amers.app.usecases.image_production import ProductionImages, run_production
-from amers.app.usecases.production import BlockIdentity
+from amers.app.usecases.image_production import ProductionImages, run_image_production
+from amers.app.usecases.new_block import BlockIdentity
 from amers.app.usecases.registration.joined_scenes import SCENES_JSON, Member, format_scenes, read_joined
 from amers.app.usecases.registration.register import SceneFiles
 from amers.services.adjustment.known_images import KnownImages
 from amers.services.errors import FormatError
 from amers.services.formats.adjusted_images import read_adjusted_images, write_adjusted_images
 from amers.services.formats.images.raster import write_raster
-from amers.services.production.from_images import Production
+from amers.services.production.image_production import Production
 from amers.services.sensors.displacement import DisplacementGrid
 from amers.services.types import Array, Frame
 from tests.command_line import amers_here
@@ -119,7 +119,7 @@ def test_a_block_beside_another_continues_it(tmp_path) -> None:
 
     def made(name: str, images: list[Path], control: ControlFiles = NO_CONTROL) -> Production:
         given = ProductionImages(tuple(images), sigma_m=BLOCK_SIGMA_M, control=control)
-        return run_production(given, tmp_path / name, BlockIdentity(name), OPTIONS)
+        return run_image_production(given, tmp_path / name, BlockIdentity(name), OPTIONS)
 
     one = made("one", files[:2])
     tied = made("tied", files[1:], ControlFiles(neighbour=tmp_path / "one.adjustment"))

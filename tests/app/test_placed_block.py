@@ -11,9 +11,9 @@ import pytest
 from amers.app.errors import InputError
 from amers.app.usecases.blocks.frame import place_block
 from amers.app.usecases.control_files import ControlFiles
-from amers.app.usecases.image_production import ProductionImages, run_production
+from amers.app.usecases.image_production import ProductionImages, run_image_production
 from amers.app.usecases.marked_files import PointStatements
-from amers.app.usecases.production import BlockIdentity
+from amers.app.usecases.new_block import BlockIdentity
 from amers.services.adjustment.intersection import intersect
 from amers.services.formats.block.check import check_block
 from amers.services.formats.block.reader import FolderChips, read_block
@@ -65,7 +65,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
         write_raster(path, view.pixels, view.geometry.delivered)
     images = tuple(sorted(folder.glob("*.tif")))
     given = ProductionImages(images, sigma_m=BLOCK_SIGMA_M)
-    run_production(given, folder / "block", BlockIdentity("made"), OPTIONS)
+    run_image_production(given, folder / "block", BlockIdentity("made"), OPTIONS)
     return Made(folder / "block", images)
 
 

@@ -7,9 +7,9 @@ import pytest
 
 from amers.app.errors import InputError
 from amers.app.usecases.control_files import ControlFiles
-from amers.app.usecases.image_production import ProductionImages, run_production
+from amers.app.usecases.image_production import ProductionImages, run_image_production
 from amers.app.usecases.marked_files import PointStatements
-from amers.app.usecases.production import BlockIdentity
+from amers.app.usecases.new_block import BlockIdentity
 from amers.services.formats.block.reader import read_document
 from amers.services.formats.gcp.reader import StatedByCaller
 from amers.services.formats.images.raster import write_raster
@@ -45,7 +45,7 @@ def test_a_block_states_the_points_that_place_it(tmp_path: Path) -> None:
     stated = PointStatements(StatedByCaller("ellipsoid"), (0.1, 0.2), (0.1, 0.2), 0.2)
     control = ControlFiles((survey(tmp_path),), stated)
     images = images_with(control, tmp_path)
-    made = run_production(images, tmp_path / "block", BlockIdentity("made"), OPTIONS)
+    made = run_image_production(images, tmp_path / "block", BlockIdentity("made"), OPTIONS)
     metadata = read_document(tmp_path / "block").metadata
     assert made.adjustment.control_active.all()
     assert set(made.control.names) == {f"survey.csv:P{k}" for k in range(6)}
@@ -57,7 +57,7 @@ def test_a_block_states_the_points_that_place_it(tmp_path: Path) -> None:
 def test_a_file_that_states_no_frame_is_refused_before_any_work(tmp_path: Path) -> None:
     control = ControlFiles((survey(tmp_path),), PointStatements(StatedByCaller("ellipsoid"), (0.1, 0.2)))
     with pytest.raises(InputError, match="--control-frame-sigma-m"):
-        run_production(
+        run_image_production(
             images_with(control, tmp_path), tmp_path / "block", BlockIdentity("made"), OPTIONS
         )
     assert not (tmp_path / "block").exists()

@@ -20,11 +20,11 @@ from rasterio.transform import from_origin
 from amers.app.errors import InputError
 from amers.app.usecases.executors import ComputeOptions
 from amers.app.usecases.ground_classes import GroundFiles
-from amers.app.usecases.image_production import ProductionImages, WorkPlace, run_production
-from amers.app.usecases.production import BlockIdentity
+from amers.app.usecases.image_production import ProductionImages, WorkPlace, run_image_production
+from amers.app.usecases.new_block import BlockIdentity
 from amers.services.formats.block.reader import read_block
 from amers.services.formats.images.raster import write_raster
-from amers.services.production.from_images import Production
+from amers.services.production.image_production import Production
 from tests.service_process import free_port
 from tests.services.simulated import BLOCK_SIGMA_M, OPTIONS, block_views, world
 
@@ -52,7 +52,7 @@ def content(block: Path) -> dict[str, str]:
 
 
 def make(images: ProductionImages, folder: Path, place: WorkPlace) -> dict[str, str]:
-    run_production(images, folder, BlockIdentity("made"), OPTIONS, place=place)
+    run_image_production(images, folder, BlockIdentity("made"), OPTIONS, place=place)
     return content(folder)
 
 
@@ -65,7 +65,7 @@ def block(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def production(images: ProductionImages, block: Path) -> Production:
     """The block made in one process."""
-    return run_production(images, block, BlockIdentity("made"), OPTIONS)
+    return run_image_production(images, block, BlockIdentity("made"), OPTIONS)
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +132,7 @@ def test_a_worker_that_is_killed_in_the_middle_changes_nothing(images, alone, tm
                 killed.append(message)
 
         place = WorkPlace(work, ComputeOptions(cluster=cluster.address))
-        run_production(
+        run_image_production(
             images, tmp_path / "block", BlockIdentity("made"), OPTIONS, place=place, progress=kill_one
         )
         assert killed
@@ -161,7 +161,7 @@ def test_an_interrupted_production_goes_on_from_where_it_was(
 
     folder = tmp_path / "block"
     with pytest.raises(StoppedHereError):
-        run_production(images, folder, BlockIdentity("made"), OPTIONS, progress=stop)
+        run_image_production(images, folder, BlockIdentity("made"), OPTIONS, progress=stop)
     assert not folder.exists()
     work = tmp_path / "block.work"
     kept = {file: file.stat().st_mtime_ns for file in work.rglob("*.npy")}
@@ -204,7 +204,7 @@ def test_points_stand_on_the_land_cover_and_not_on_water_or_excluded_ground(imag
     polygon = {"type": "Polygon", "coordinates": [north]}
     (tmp_path / "north.geojson").write_text(json.dumps(polygon))
     ground = GroundFiles((tmp_path / "north.geojson",), tmp_path / "cover.tif")
-    made = run_production(
+    made = run_image_production(
         replace(images, ground=ground), tmp_path / "block", BlockIdentity("made"), OPTIONS
     )
     places = made.points.lon_lat_h[:, :2]
@@ -227,16 +227,18 @@ def test_work_on_other_images_is_refused(images, tmp_path) -> None:
             raise StoppedHereError
 
     with pytest.raises(StoppedHereError):
-        run_production(images, tmp_path / "a", BlockIdentity("a"), OPTIONS, place=work, progress=stop)
+        run_image_production(
+            images, tmp_path / "a", BlockIdentity("a"), OPTIONS, place=work, progress=stop
+        )
     with pytest.raises(InputError, match=r"other inputs.*--work"):
-        run_production(fewer, tmp_path / "b", BlockIdentity("b"), OPTIONS, place=work)
+        run_image_production(fewer, tmp_path / "b", BlockIdentity("b"), OPTIONS, place=work)
 
 
 def test_a_cluster_that_does_not_answer_is_named(images, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("amers.app.usecases.executors._SECONDS_TO_CONNECT", 1)
     place = WorkPlace(compute=ComputeOptions(cluster="tcp://127.0.0.1:9"))
     with pytest.raises(InputError, match=r"--cluster: tcp://127\.0\.0\.1:9: no scheduler"):
-        run_production(images, tmp_path / "block", BlockIdentity("made"), OPTIONS, place=place)
+        run_image_production(images, tmp_path / "block", BlockIdentity("made"), OPTIONS, place=place)
 
 
 def test_what_is_made_is_a_valid_block(block, production) -> None:

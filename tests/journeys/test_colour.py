@@ -7,15 +7,15 @@ import cv2
 import numpy as np
 import pytest
 
-from amers.app.usecases.image_production import ProductionImages, run_production
-from amers.app.usecases.production import BlockIdentity
+from amers.app.usecases.image_production import ProductionImages, run_image_production
+from amers.app.usecases.new_block import BlockIdentity
 from amers.services.formats.block.check import check_block
 from amers.services.formats.block.reader import FolderChips
 from amers.services.formats.images.scenes import read_scene
 from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
 from amers.services.imagery.scene import Scene, scene_gsd_m
 from amers.services.imagery.source import Window
-from amers.services.production.from_images import ProductionOptions
+from amers.services.production.image_production import ProductionOptions
 from amers.services.registration.on_points import register_scene
 from amers.services.sensors.base import SensorModel
 from amers.services.types import Array, FloatImage
@@ -54,7 +54,7 @@ def block(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("colour") / "ventoux"
     images = [folder / "left_image.tif", folder / "right_image.tif"]
     options = ProductionOptions(fine_gsd_m=0.5, coarse_gsd_m=1.0)
-    run_production(ProductionImages(tuple(images)), made, BlockIdentity("ventoux"), options)
+    run_image_production(ProductionImages(tuple(images)), made, BlockIdentity("ventoux"), options)
     return made
 
 

@@ -13,7 +13,7 @@ from amers.services.geodesy import east_north_up
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage, Window
 from amers.services.matching.reference_image import Reference
-from amers.services.production.from_images import Production, ProductionOptions, produce_points
+from amers.services.production.image_production import Production, ProductionOptions, produce_points
 from amers.services.registration.on_points import Registration, register_scene
 from amers.services.registration.on_reference import register_on_reference
 from amers.services.types import ControlPoints

@@ -15,7 +15,8 @@ from amers.app.usecases.blocks.quality import (
     SiteFile,
     assess_folder,
 )
-from amers.app.usecases.production import BlockIdentity, OrthoFiles, run_ortho_production
+from amers.app.usecases.new_block import BlockIdentity
+from amers.app.usecases.ortho_production import OrthoFiles, run_ortho_production
 from amers.app.usecases.terrain_file import TerrainFile
 
 pytestmark = [pytest.mark.long, pytest.mark.real_data, pytest.mark.thorough]

@@ -13,7 +13,7 @@ from amers.services.formats.sensor_models.rpc_files import read_rpc
 from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
 from amers.services.imagery.scene import scene_gsd_m
 from amers.services.imagery.source import ArrayImage, Window
-from amers.services.production.from_images import ProductionOptions, produce_points
+from amers.services.production.image_production import ProductionOptions, produce_points
 from amers.services.registration.on_points import register_scene
 from amers.services.sensors.base import SensorModel
 from amers.services.sensors.correction import ImageCorrection, fold_into_rpc, no_correction

@@ -10,7 +10,7 @@ from amers.services.adjustment.intersection import intersect
 from amers.services.formats.images.scenes import read_scene
 from amers.services.imagery.source import Window
 from amers.services.joint.registration import register_together
-from amers.services.production.from_images import ProductionOptions, produce_points
+from amers.services.production.image_production import ProductionOptions, produce_points
 from amers.services.sensors.correction import CorrectedModel, no_correction
 from tests.journeys.ties import independent_tracks
 from tests.services.simulated import MemoryChips

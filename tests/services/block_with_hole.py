@@ -12,7 +12,7 @@ from amers.services.geodesy import box_around, east_north_up, move_metres
 from amers.services.imagery.scene import Scene
 from amers.services.matching.multi_image import refine_on_chips
 from amers.services.production.control_points import ControlBlock
-from amers.services.production.from_images import Production, produce_points
+from amers.services.production.image_production import Production, produce_points
 from amers.services.sensors.base import SensorModel
 from amers.services.simulation.orbit import sun_direction
 from amers.services.simulation.render import Radiometry

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from amers.services.production.from_images import Production, ProductionOptions, produce_points
+from amers.services.production.image_production import Production, ProductionOptions, produce_points
 from amers.services.simulation.view import (
     SimulatedView,
     ViewGeometry,

@@ -8,7 +8,7 @@ import pytest
 from amers.services.formats.images.scenes import read_scene
 from amers.services.geodesy import box_around, east_north_up
 from amers.services.imagery.scene import Scene
-from amers.services.production.from_images import ProductionOptions, produce_points
+from amers.services.production.image_production import ProductionOptions, produce_points
 from amers.services.production.new_points import points_where_short, registered_scene, short_ground
 from amers.services.registration.on_points import register_scene
 from amers.services.registration.options import RegistrationOptions

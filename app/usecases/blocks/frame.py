@@ -11,7 +11,7 @@ import numpy as np
 
 from amers.app.errors import InputError
 from amers.app.usecases.control_files import ControlFiles, read_control
-from amers.app.usecases.production import refuse_existing
+from amers.app.usecases.new_block import refuse_existing
 from amers.services.adjustment.frame_fit import FrameFit, fit_frame, misfits_m
 from amers.services.formats.block.document import (
     AccuracyFigure,

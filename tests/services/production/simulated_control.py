@@ -7,7 +7,7 @@ import numpy as np
 from amers.services.adjustment.intersection import intersect
 from amers.services.imagery.scene import Scene
 from amers.services.production.control import Control
-from amers.services.production.from_images import Production, produce_points
+from amers.services.production.image_production import Production, produce_points
 from amers.services.simulation.view import SimulatedView, simulate_block
 from amers.services.tasks import Work
 from amers.services.types import Array, Observations

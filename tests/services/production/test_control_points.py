@@ -10,7 +10,7 @@ from amers.services.errors import NotEnoughPoints
 from amers.services.geodesy import east_north_up, move_metres
 from amers.services.production.control import Control
 from amers.services.production.control_points import ControlBlock
-from amers.services.production.from_images import Production, produce_points
+from amers.services.production.image_production import Production, produce_points
 from amers.services.types import Array, ControlPoints, Frame
 from tests.services.production.simulated_control import frame_error_m, free, placed, views
 from tests.services.simulated import OPTIONS, MemoryChips

@@ -6,8 +6,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from amers.services.production.from_images import _dates
 from amers.services.production.image_passes import image_passes
+from amers.services.production.image_production import _dates
 from amers.services.types import Acquisition, Observations
 
 START = datetime(2024, 5, 1, 10, tzinfo=UTC)

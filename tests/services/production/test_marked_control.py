@@ -8,7 +8,7 @@ import pytest
 
 from amers.services.geodesy import move_metres
 from amers.services.production.control import Control
-from amers.services.production.from_images import Production
+from amers.services.production.image_production import Production
 from amers.services.production.marked_control import MarkedGround
 from amers.services.simulation.view import SimulatedView
 from amers.services.types import Frame, Observations

@@ -9,8 +9,8 @@ import pytest
 from amers.services.errors import NotEnoughPoints
 from amers.services.imagery.source import ArrayImage
 from amers.services.production.control import Control
-from amers.services.production.from_images import Production
 from amers.services.production.height_control import ControlHeights
+from amers.services.production.image_production import Production
 from amers.services.production.ortho_control import ControlOrtho
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.terrain import Terrain

@@ -9,7 +9,7 @@ from amers.services.errors import NotEnoughPoints
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage
 from amers.services.production.control import Control
-from amers.services.production.from_images import Production, produce_points
+from amers.services.production.image_production import Production, produce_points
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.types import Acquisition, Array
 from tests.services.production.simulated_control import CHI2_3, scenes, views

@@ -13,8 +13,8 @@ from amers.services.formats.elevation.dem import read_dem
 from amers.services.imagery.scene import Scene
 from amers.services.matching.ground_features import FeatureOptions
 from amers.services.production.control import Control
-from amers.services.production.from_images import Production, ProductionOptions, produce_points
 from amers.services.production.height_control import ControlHeights
+from amers.services.production.image_production import Production, ProductionOptions, produce_points
 from amers.services.production.tie_points import find_tie_points
 from amers.services.tasks import Work
 from amers.services.types import Frame, no_progress

@@ -10,10 +10,14 @@ from scipy.ndimage import map_coordinates
 from amers.services.errors import InputError, NotEnoughPoints
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage
-from amers.services.production.from_ortho import OrthoPointOptions, OrthoPoints, produce_ortho_points
+from amers.services.production.ortho_production import (
+    OrthoPointOptions,
+    OrthoPoints,
+    produce_ortho_points,
+)
 from amers.services.registration.on_points import register_scene
 from amers.services.types import Array
-from tests.services.production.test_from_ortho import FLAT, GSD_M, SIDE, chips_of, land, ortho
+from tests.services.production.test_ortho_production import FLAT, GSD_M, SIDE, chips_of, land, ortho
 from tests.services.textures import as_pixels, texture
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]

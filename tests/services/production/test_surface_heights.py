@@ -18,7 +18,7 @@ from amers.services.imagery.source import ArrayImage, Window, render_chip
 from amers.services.matching.correlate import FOUND, CorrelationOptions, find_chip
 from amers.services.matching.ground_features import FeatureOptions
 from amers.services.matching.surface_heights import surface_height
-from amers.services.production.from_images import Production, ProductionOptions, produce_points
+from amers.services.production.image_production import Production, ProductionOptions, produce_points
 from amers.services.production.tie_points import find_tie_points
 from amers.services.simulation.view import SimulatedView, simulate_block
 from amers.services.simulation.world import World

@@ -12,7 +12,11 @@ from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage
 from amers.services.map_grid import MapGrid
 from amers.services.matching.reference_image import Reference
-from amers.services.production.from_ortho import GroundHeights, OrthoPointOptions, produce_ortho_points
+from amers.services.production.ortho_production import (
+    GroundHeights,
+    OrthoPointOptions,
+    produce_ortho_points,
+)
 from amers.services.quality.planimetry import planimetric_quality
 from amers.services.quality.site_errors import POINTS, Site, SiteErrors, expected_reach_m, point_errors
 from amers.services.sensors.ortho import OrthoModel

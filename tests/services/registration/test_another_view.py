@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from amers.services.errors import NoConsensus
-from amers.services.production.from_images import produce_points
+from amers.services.production.image_production import produce_points
 from amers.services.registration.on_points import register_scene
 from amers.services.simulation.view import plan_geometry, simulate_block, simulate_view
 from amers.services.simulation.world import make_world

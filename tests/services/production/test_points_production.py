@@ -9,7 +9,7 @@ import pytest
 from amers.services.errors import InputError, NotEnoughPoints
 from amers.services.geodesy import east_north_up, move_metres
 from amers.services.imagery.scene import Scene
-from amers.services.production.from_points import (
+from amers.services.production.points_production import (
     MISSING,
     NO_HEIGHT,
     NOT_CONFIRMED,
@@ -23,7 +23,7 @@ from amers.services.production.from_points import (
 from amers.services.registration.on_points import register_scene
 from amers.services.simulation.view import SimulatedView, simulate_view, true_ground
 from amers.services.types import UNKNOWN_FRAME, Array, Frame, GroundPoints
-from tests.services.production.test_from_ortho import GSD_M, SIDE, land, ortho
+from tests.services.production.test_ortho_production import GSD_M, SIDE, land, ortho
 from tests.services.production.test_several_orthos import LOCAL_PX, date, errors_m, named
 from tests.services.simulated import SHAPE, MemoryChips, plan, world
 from tests.services.textures import as_pixels, moved

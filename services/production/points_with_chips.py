@@ -14,7 +14,7 @@ from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import image_gsd_m, render_chip
 from amers.services.matching.multi_image import nearly_whole, stored_chip
 from amers.services.production.detail_points import detail_saliency
-from amers.services.production.from_points import (
+from amers.services.production.points_production import (
     MIN_POINTS,
     MISSING,
     NO_HEIGHT,

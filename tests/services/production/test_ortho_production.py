@@ -12,7 +12,7 @@ from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage, render_chip
 from amers.services.map_grid import MapGrid
 from amers.services.matching.multi_image import chip_inside
-from amers.services.production.from_ortho import (
+from amers.services.production.ortho_production import (
     GroundHeights,
     OrthoPointOptions,
     OrthoPoints,

@@ -11,8 +11,13 @@ from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage, image_gsd_m, low_pass, render_chip
 from amers.services.map_grid import MapGrid, lon_lat_of_xy, xy_of_lon_lat
 from amers.services.matching.correlate import FOUND, CorrelationOptions, find_chip
-from amers.services.production.from_chips import NO_CHIP, NOT_SHOWN, OwnChips, produce_points_with_chips
-from amers.services.production.from_points import MISSING, NO_HEIGHT, NOT_SALIENT, SAME_PLACE
+from amers.services.production.points_production import MISSING, NO_HEIGHT, NOT_SALIENT, SAME_PLACE
+from amers.services.production.points_with_chips import (
+    NO_CHIP,
+    NOT_SHOWN,
+    OwnChips,
+    produce_points_with_chips,
+)
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.types import Acquisition, Array, Frame, GroundPoints
 from tests.services.chip_bases import CORNER_XY, UTM, image, north_up

@@ -11,7 +11,7 @@ from amers.services.errors import ComputationError, InputError, NotEnoughPoints
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage, render_chip
 from amers.services.matching.multi_image import stored_chip
-from amers.services.production.from_images import Production, ProductionOptions, produce_points
+from amers.services.production.image_production import Production, ProductionOptions, produce_points
 from amers.services.simulation.view import plan_geometry
 from amers.services.tasks import Work
 from amers.services.types import Array, BoolArray, Observations
