@@ -26,6 +26,7 @@ from amers.app.outages import outage_of
 from amers.app.request_context import Origin, working_for
 from amers.app.storage import Storage
 from amers.app.usecases import results, storage_identity
+from amers.app.worker.limits import NO_ROOM, OUT_OF_MEMORY, STORAGE_AWAY
 from amers.app.worker.warm_process import WarmProcess, WarmServer
 
 FAILURES_ALLOWED = 3
@@ -38,12 +39,6 @@ processes has died, or somebody stops the service. No job can be blamed for thes
 POLL_S = 0.2
 LONGEST_BEAT_S = 2.0
 """Longest time between renewals of a lease; a dismissed job is noticed within this time."""
-OUT_OF_MEMORY = 77
-"""Exit code of a process that reached its memory limit."""
-NO_ROOM = 78
-"""Exit code of a process that found a disk full."""
-STORAGE_AWAY = 79
-"""Exit code of a process whose storage is not mounted, is another one or takes no files."""
 
 log = logging.getLogger(__name__)
 

@@ -17,8 +17,7 @@ from amers.app.db.jobs.attempts import LostJob
 from amers.app.errors import StorageOutage, is_no_memory, is_no_room
 from amers.app.request_context import Origin, working_for
 from amers.app.usecases.jobs import do_attempt
-from amers.app.worker.attempt import NO_ROOM, OUT_OF_MEMORY, STORAGE_AWAY
-from amers.app.worker.warm_server import limit_files, limit_memory
+from amers.app.worker.limits import NO_ROOM, OUT_OF_MEMORY, STORAGE_AWAY, limit_files, limit_memory
 
 log = logging.getLogger(__name__)
 

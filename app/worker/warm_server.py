@@ -13,7 +13,6 @@ import json
 import logging
 import os
 import random
-import resource
 import selectors
 import signal
 import socket
@@ -182,20 +181,6 @@ def die_with(parent: int) -> None:
         raise OSError(ctypes.get_errno(), "prctl")
     if os.getppid() != parent:
         sys.exit("the parent of this process has ended")
-
-
-def limit_memory(extra_bytes: int) -> None:
-    """Limit what this process may allocate in addition to what its libraries have already reserved."""
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    limit = pages * resource.getpagesize() + extra_bytes
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-
-
-def limit_files(largest_bytes: int) -> None:
-    """Make the kernel end this process by SIGXFSZ when it writes a larger file, in whatever library."""
-    signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (largest_bytes, largest_bytes))
 
 
 def _refuse_threads() -> None:

@@ -14,7 +14,8 @@ from amers.app.db.jobs.jobs import Job
 from amers.app.errors import InputError
 from amers.app.storage import Storage
 from amers.app.worker import attempt
-from amers.app.worker.attempt import ATTEMPTS_ALLOWED, NO_ROOM, OUT_OF_MEMORY, Attempts
+from amers.app.worker.attempt import ATTEMPTS_ALLOWED, Attempts
+from amers.app.worker.limits import NO_ROOM, OUT_OF_MEMORY
 from tests.app.job_queue import new_job, state_of
 from tests.statements import run_sql
 

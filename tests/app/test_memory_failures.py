@@ -20,7 +20,7 @@ import json, resource, sys
 import rasterio
 from rasterio.windows import Window
 from amers.app.errors import is_no_memory
-from amers.app.worker.warm_server import limit_memory
+from amers.app.worker.limits import limit_memory
 from amers.services.formats.images.datasets import as_format_error
 from pathlib import Path
 

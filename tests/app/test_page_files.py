@@ -2,8 +2,10 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from gzip import compress
 from pathlib import Path
 
@@ -99,3 +101,13 @@ def test_the_types_of_the_page_are_those_of_the_api_and_the_report():
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
     assert check.returncode == 0, check.stdout + check.stderr
+
+
+def test_the_modules_of_the_page_import_each_other_in_no_circle():
+    sources = (ROOT / "web" / "source").glob("*.ts")
+    imported = {
+        one.stem: set(re.findall(r'from "\./(\w+)"', one.read_text(encoding="utf-8"))) for one in sources
+    }
+    assert "api" in imported["main"]
+    # Raises CycleError, which names the modules.
+    assert list(TopologicalSorter(imported).static_order())[-1] == "main"

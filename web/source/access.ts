@@ -3,7 +3,7 @@
 import { get, Refused, setToken, token } from "./api";
 import type { Scope, TokenRecord } from "./api_types";
 import { fill, h, problem } from "./elements";
-import type { ShowView } from "./place";
+import type { ShowView } from "./view";
 
 export type Caller = Pick<TokenRecord, "name" | "scopes">;
 const INCLUDED: Record<Scope, Scope[]> = {

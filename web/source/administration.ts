@@ -2,22 +2,12 @@
 
 import { showAudit } from "./audit";
 import { fill, h, problem } from "./elements";
-import { announce, type ShowView } from "./place";
+import { announce } from "./page";
 import { showReferences } from "./references";
 import { showStatus } from "./status";
 import { showSuspensions } from "./suspensions";
 import { showTokens } from "./tokens";
-
-/** A view of the administration, below the links; `h1` has the title. */
-export type ShowPart = (part: Part) => Promise<void>;
-
-export interface Part {
-  /** The element below the title. */
-  content: HTMLElement;
-  signal: AbortSignal;
-  /** Carry out a change, then show the view again with the focus on its title; an error becomes a sentence. */
-  change: (act: () => Promise<string>) => Promise<void>;
-}
+import type { Part, ShowPart, ShowView } from "./view";
 
 const PARTS: Record<string, { title: string; show: ShowPart }> = {
   status: { title: "Queue and storage", show: showStatus },

@@ -3,7 +3,7 @@
 import { post } from "./api";
 import type { Scene, StatusInfo } from "./api_types";
 import { fill, h, problem } from "./elements";
-import { go } from "./place";
+import { go } from "./page";
 import { uploadBeside } from "./upload";
 
 const METHODS = { auto: "control points, or else a reference image", points: "control points only", reference: "a reference image" };

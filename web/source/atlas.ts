@@ -11,13 +11,11 @@ import {
   VectorTileSource,
 } from "maplibre-gl";
 import { authorization, BASE, get } from "./api";
-import { Comparison, type Pyramids } from "./comparison";
+import { type Bounds, Comparison, type Pyramids } from "./comparison";
 import { h } from "./elements";
 import { goToField, TOWNS } from "./go_to";
 import { degrees, graticule, wrapped } from "./graticule";
 import { type Colouring, landFile, mapStyle, TOWNS_ZOOM } from "./style";
-
-export type Bounds = [west: number, south: number, east: number, north: number];
 
 type Outlined = Feature<Geometry | null>;
 type Shape = Geometry | { type: "FeatureCollection"; features: Outlined[] };

@@ -1,9 +1,9 @@
 // The audit trail: every change, newest first, by who made it and what it changed.
 
-import type { ShowPart } from "./administration";
 import { address, get } from "./api";
 import type { ChangeRecord, ChangeRecords } from "./api_types";
 import { badge, fill, h, problem, when } from "./elements";
+import type { ShowPart } from "./view";
 
 const KINDS = ["token", "block", "scene", "job", "point", "reference_image", "audit"];
 const LISTED = 50;

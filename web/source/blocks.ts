@@ -5,8 +5,9 @@ import type { BlockQuality, StatusInfo } from "./api_types";
 import type { Atlas } from "./atlas";
 import { ask } from "./confirmation";
 import { accuracy, badge, facts, figure, fill, h, plural, problem, when } from "./elements";
-import { announce, go, type Place, type ShowView } from "./place";
+import { announce, go } from "./page";
 import { send } from "./upload";
+import type { Place, ShowView } from "./view";
 
 const ARCHIVES = ".zip,.tar,.tar.gz,.tgz";
 

@@ -1,9 +1,9 @@
 // One scene on the map through two models: either of them, or both beside a divider that is moved.
 
 import type { CustomLayerInterface, Map as MapLibre } from "maplibre-gl";
-import type { Bounds } from "./atlas";
 import { h } from "./elements";
 
+export type Bounds = [west: number, south: number, east: number, north: number];
 export type Model = "raw" | "registered";
 export type Shown = Model | "swipe";
 

@@ -4,12 +4,13 @@ import type { Feature, FeatureCollection } from "geojson";
 import { blobUrl, get } from "./api";
 import type { ResultFile, Scene, StatusInfo } from "./api_types";
 import { accuracy, figure, fill, h, plural, problem } from "./elements";
-import { stateText } from "./job";
-import { announce, type Place, type ShowView } from "./place";
+import { announce } from "./page";
+import { run, stateText } from "./processes";
 import { collection, type Kind, KINDS, type Pixel, type Shape } from "./shapes";
-import { run, tilesOf } from "./tiles";
+import { tilesOf } from "./tiles";
 import { uploadBeside } from "./upload";
 import { Viewer } from "./viewer";
+import type { Place, ShowView } from "./view";
 
 const DRAWN = "drawn.geojson";
 const OF_MAP = "of_map.geojson";

@@ -4,7 +4,7 @@ import type { Feature, FeatureCollection, Point, Position } from "geojson";
 import { get } from "./api";
 import { h, problem } from "./elements";
 import { degrees } from "./graticule";
-import { announce } from "./place";
+import { announce } from "./page";
 
 /** A country with the box of its largest part, or a town, which has none. */
 type Named = Feature<Point, { name: string; box?: [west: number, south: number, east: number, north: number] }>;

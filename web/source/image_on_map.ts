@@ -2,13 +2,12 @@
 
 import { BASE } from "./api";
 import type { StatusInfo } from "./api_types";
-import type { Bounds } from "./atlas";
-import type { Comparison, Model, Pyramid, Shown } from "./comparison";
+import type { Bounds, Comparison, Model, Pyramid, Shown } from "./comparison";
 import { accuracy, figure, fill, h, problem } from "./elements";
-import { stateText } from "./job";
-import { announce, type Place } from "./place";
+import { announce } from "./page";
+import { drawn, stateText } from "./processes";
 import type { Report } from "./report_types";
-import { drawn } from "./tiles";
+import type { Place } from "./view";
 
 const PROCESS = "map-scene";
 const CHOICES: Record<Shown, string> = { swipe: "Both, with a divider", raw: "Raw", registered: "Registered" };

@@ -6,10 +6,12 @@ import type { Atlas } from "./atlas";
 import { drawBlocks } from "./blocks";
 import type { ResultFile, StatusInfo } from "./api_types";
 import { accuracy, badge, facts, figure, fill, h, problem, when } from "./elements";
-import { announce, markSection, pause, type Place, type ShowView } from "./place";
+import { announce, markSection, pause } from "./page";
+import { ended, find, stateText } from "./processes";
 import type { Criterion, Report } from "./report_types";
 import { imageOnMap } from "./image_on_map";
 import { type PointResultProperties, residualVectors } from "./residuals";
+import type { Place, ShowView } from "./view";
 
 const POLL_MS = 1000;
 
@@ -41,15 +43,6 @@ export const showJob: ShowView = async (place, id) => {
   else fill(body, outcome(job), await failureReport(job, signal));
 };
 
-/** The state of a job. */
-export function find(id: string, signal: AbortSignal): Promise<StatusInfo> {
-  return get<StatusInfo>(`jobs/${encodeURIComponent(id)}`, signal);
-}
-
-export function ended(job: StatusInfo): boolean {
-  return !["accepted", "running"].includes(job.status);
-}
-
 function progressOf(first: StatusInfo): { element: HTMLElement; update(job: StatusInfo): void } {
   const bar = h("progress", { max: 100, "aria-label": "Progress of the job" });
   const words = h("p", {});
@@ -70,14 +63,6 @@ function progressOf(first: StatusInfo): { element: HTMLElement; update(job: Stat
       stop.replaceWith(problem(error));
     }
   }
-}
-
-/** The state of a job that has not ended, in words. */
-export function stateText(job: StatusInfo): string {
-  const { "amers:queuePosition": position, "amers:estimatedEnd": end } = job;
-  const waiting = position == null ? "Waiting for a worker" : `Waiting for a worker: number ${position} in the queue`;
-  const state = job.status === "accepted" ? waiting : `${job.progress} % · ${job.message ?? "running"}`;
-  return end ? `${state} · expected to end on ${when(end)}` : state;
 }
 
 function outcome(job: StatusInfo): HTMLElement {

@@ -8,9 +8,10 @@ import { drawBlocks, showBlock, showBlocks } from "./blocks";
 import { showDrawing } from "./draw";
 import { h, problem } from "./elements";
 import { showJob } from "./job";
-import { go, markSection, type ShowView } from "./place";
+import { go, markSection } from "./page";
 import { showPoint, showPoints } from "./points";
 import { showScene, showScenes } from "./scenes";
+import type { ShowView } from "./view";
 
 const VIEWS: Record<string, { show: ShowView; section: string }> = {
   points: { show: showPoints, section: "points" },

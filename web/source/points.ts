@@ -4,8 +4,8 @@ import { blobUrl, type FeaturePage, get, type PointOfPage } from "./api";
 import type { PointViewProperties, PointWithViews } from "./api_types";
 import { facts, figure, fill, h, plural, problem } from "./elements";
 import type { Atlas } from "./atlas";
-import type { ShowView } from "./place";
 import { type Colouring, COLOURINGS } from "./style";
+import type { ShowView } from "./view";
 
 const LISTED = 50;
 const SETTLED_MS = 250;

@@ -1,10 +1,10 @@
 // Reference images: those of the installation, a new one from files of the server, and removal.
 
-import type { ShowPart } from "./administration";
 import { get, post, remove } from "./api";
 import type { Reference, References } from "./api_types";
 import { ask } from "./confirmation";
 import { day, figure, fill, h } from "./elements";
+import type { ShowPart } from "./view";
 
 const FIELDS: [name: string, label: string, hint: string][] = [
   ["name", "Name", "for people"],

@@ -5,8 +5,9 @@ import { register, registrationForm } from "./again";
 import { get } from "./api";
 import type { Jobs, Scene, SceneRegistration, Scenes, StatedAccuracy, StatusInfo } from "./api_types";
 import { accuracy, badge, bytes, day, facts, figure, fill, h, problem, when } from "./elements";
-import { go, type Place, type ShowView } from "./place";
+import { go } from "./page";
 import { send, uploadBeside } from "./upload";
+import type { Place, ShowView } from "./view";
 
 const IMAGES = ".tif,.tiff,.jp2,.j2k,.ntf,.nitf,.zip,.tar";
 const MODELS = ".txt,.xml,.rpb,.rpc,.geom";

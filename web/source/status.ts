@@ -1,9 +1,9 @@
 // The queue and the storage of the installation, and what every owner keeps.
 
-import type { ShowPart } from "./administration";
 import { get } from "./api";
 import type { InstallationStatus, OwnersUsage, OwnerUsage } from "./api_types";
 import { bytes, facts, figure, fill, h } from "./elements";
+import type { ShowPart } from "./view";
 
 const HOUR_S = 3600;
 

@@ -1,9 +1,9 @@
 // Suspensions: the points that their history proposes to suspend, and those that are suspended.
 
-import type { ShowPart } from "./administration";
 import { type FeaturePage, get, type PointHistory, post } from "./api";
 import { ask } from "./confirmation";
 import { day, figure, fill, h, plural } from "./elements";
+import type { ShowPart } from "./view";
 
 const LISTED = 100;
 

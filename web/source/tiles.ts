@@ -1,12 +1,10 @@
 // The tiles of a raw image, fetched by ranges of one file.
 
-import { call, get, post, Refused } from "./api";
-import type { Jobs, ResultFile, StatusInfo } from "./api_types";
-import { ended, find } from "./job";
-import { pause } from "./place";
+import { call, get } from "./api";
+import type { ResultFile, StatusInfo } from "./api_types";
+import { drawn } from "./processes";
 
 const PROCESS = "view-scene";
-const POLL_MS = 400;
 const MOST_TILES = 300;
 
 interface Level {
@@ -63,38 +61,4 @@ export async function tilesOf(scene: string, signal: AbortSignal, report: (job: 
   const { results } = await drawn(PROCESS, { scene }, signal, report);
   const { href } = results["tiles.json"] as ResultFile;
   return new Tiles(await get<TileIndex>(href, signal), (results["tiles.bin"] as ResultFile).href, signal);
-}
-
-/** A job with some inputs and its results: an earlier one, or a new one, whose state `report` gets. */
-export async function drawn(
-  process: string,
-  inputs: Record<string, unknown>,
-  signal: AbortSignal,
-  report: (job: StatusInfo) => void,
-): Promise<{ job: StatusInfo; results: Record<string, unknown> }> {
-  const resultsOf = (job: StatusInfo): Promise<Record<string, unknown>> => get(`jobs/${job.jobID}/results`, signal);
-  const { jobs } = await get<Jobs>(`jobs?processID=${process}&status=successful&limit=100`, signal);
-  const earlier = jobs.find((job) => Object.entries(inputs).every(([name, value]) => (job.inputs[name] ?? null) === value));
-  if (earlier) {
-    try {
-      return { job: earlier, results: await resultsOf(earlier) };
-    } catch (error) {
-      // Its results were removed.
-      if (!(error instanceof Refused)) throw error;
-    }
-  }
-  const job = await run(process, inputs, signal, report);
-  return { job, results: await resultsOf(job) };
-}
-
-/** Run a process to its end; an unsuccessful one is thrown in the words of the service. */
-export async function run(process: string, inputs: object, signal: AbortSignal, report: (job: StatusInfo) => void): Promise<StatusInfo> {
-  let job = await post<StatusInfo>(`processes/${process}/execution`, { inputs });
-  while (!ended(job)) {
-    report(job);
-    await pause(POLL_MS, signal);
-    job = await find(job.jobID, signal);
-  }
-  if (job.status !== "successful") throw new Error(job.error?.detail ?? `The job is ${job.status}.`);
-  return job;
 }

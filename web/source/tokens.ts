@@ -1,10 +1,10 @@
 // Tokens: those of all callers, a new one whose secret is shown once, and revocation.
 
-import type { ShowPart } from "./administration";
 import { get, post, remove } from "./api";
 import type { NewTokenRecord, Scope, TokenRecord, TokenRecords } from "./api_types";
 import { ask } from "./confirmation";
 import { badge, bytes, day, fill, h, problem } from "./elements";
+import type { ShowPart } from "./view";
 
 const SCOPES: Record<Scope, string> = {
   read: "points, chips, published blocks",

@@ -1,17 +1,4 @@
-// What every view gets, and how it leads to another.
-
-import type { Atlas } from "./atlas";
-
-export interface Place {
-  panel: HTMLElement;
-  atlas: Atlas;
-  /** Aborts when another view is shown. */
-  signal: AbortSignal;
-  /** The caller's scopes; empty for the public. */
-  scopes: string[];
-}
-/** Fills the panel; the word after the view's name in the address is its argument. */
-export type ShowView = (place: Place, argument: string) => Promise<void>;
+// What the page does for all its views: lead to another, announce, wait.
 
 export function go(address: string): void {
   location.hash = address;
