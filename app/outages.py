@@ -44,20 +44,20 @@ def _database(reason: str, *, status: int = 503, again: bool = True, quotes: boo
 
 
 READ_ONLY = _database(
-    "the database is read-only: it is a standby, or its settings or those of its role allow no writes; "
-    "what reads goes on, nothing can be stored"
+    "the database is read-only: it is a standby, or the settings of the database or of its role allow "
+    "no writes. Requests that read still work; nothing can be stored"
 )
 NO_ANSWER = _database("the database does not answer")
 LIMIT = _database("the request took the database too long and was stopped; ask for less", again=False)
 DISK_FULL = _database(
-    "the disk of the database is full: nothing of this was stored, and the operator has to free room",
+    "the disk of the database is full: nothing was stored; the operator has to free space",
     status=507,
 )
 RIGHTS = _database(
     "the role of the database may not do this; its owner has to grant it", again=False, quotes=True
 )
 MISSING = _database(
-    "the database lacks what this Amers needs: PostGIS or a table is not where it was when the service "
+    "PostGIS or a table that Amers needs is missing in the database, or has moved since the service "
     "started; run `amers db status`",
     again=False,
     quotes=True,
@@ -83,10 +83,10 @@ BY_STATE: dict[str, Outage] = {
     "53200": _database("the server of the database is out of memory"),
     "53300": _database("the database has no more connections to give"),
     "40001": _database(
-        "the database stopped a statement that others or its recovery stood in the way of"
+        "the database stopped a statement that conflicted with another one, or with its recovery"
     ),
     "40P01": _database("the database stopped one of two transactions that waited for each other"),
-    "55P03": _database("somebody else holds what this needs, for longer than it may wait"),
+    "55P03": _database("another transaction kept a lock for longer than this request may wait"),
     "42501": RIGHTS,
     "42P01": MISSING,
     "42883": MISSING,

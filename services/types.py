@@ -86,10 +86,10 @@ class Frame:
     """Position of the frame of a block on the Earth: an error that all points of the block share.
 
     Attributes:
-        covariance_m2: (3, 3) of east, north, up; NaN where nobody stated it.
+        covariance_m2: (3, 3) of east, north, up; NaN where it is not stated.
         shared_m2: (3, 3) of what neighbouring points of the block are off by together, beyond its frame:
             deformations, by the errors of its images. It is part of the covariance of every point; zero
-            where nobody stated it.
+            where it is not stated.
     """
 
     covariance_m2: Array
@@ -149,7 +149,7 @@ class ControlPoints:
         chip_file: (n,) int64, rows of `chip_files`.
         chip_row: (n,) int64, row of the first chip of the point in its file; the others follow it.
         chip_files: names of the files in their `ChipSource`.
-        surface: heights of the surface at the points; None when nobody stated them.
+        surface: heights of the surface at the points; None where they are not stated.
     """
 
     id: IntArray

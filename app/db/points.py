@@ -98,7 +98,7 @@ POINTS = Collection(
         column_property(point.c.corr_north_up, "Correlation of north and height"),
         column_property(point.c.n_views, "Images that see the point"),
         column_property(point.c.saliency, "How well its chips can be located, 0 to 1"),
-        column_property(point.c.typology, "What it is on the ground"),
+        column_property(point.c.typology, "Kind of object on the ground"),
         column_property(point.c.first_view, "Date of the first view"),
         column_property(point.c.last_view, "Date of the last view"),
         column_property(point.c.block_number, "Number of its block"),

@@ -124,8 +124,8 @@ def _neighbour(folder: Path, blocks: Sequence[ControlBlock]) -> KnownImages:
     block, known = read_adjusted_images(folder / IMAGES_NPZ)
     if block in (one.name for one in blocks):
         raise InputError(
-            f"{block}: given as control and as neighbour, which tell the same twice; give it as "
-            "neighbour alone (--neighbour): its images tell all that its points do"
+            f"{block}: given as control and as neighbour, which would count it twice; give it with "
+            "--neighbour only: its images contain all the information of its points"
         )
     return known
 
@@ -147,8 +147,8 @@ def _ortho(path: Path, sigma_m: float | None, stack: ExitStack) -> ControlOrtho:
     stated_m = sigma_m or product_sigma_m(scene.acquisition.sensor)
     if stated_m is None:
         raise InputError(
-            f"{path}: nobody states how accurate this ortho-image is on the Earth: state it "
-            "(--control-ortho-sigma-m), one standard deviation a coordinate in metres"
+            f"{path}: the accuracy of this ortho-image on the Earth is not stated: give it with "
+            "--control-ortho-sigma-m, one standard deviation of each coordinate in metres"
         )
     gsd_m = scene.model.grid.gsd_m
     reference = Reference(
@@ -167,9 +167,9 @@ def _heights(heights: HeightFile) -> ControlHeights:
     name = heights.terrain.dem.name
     if heights.sigma_m is None or heights.frame_sigma_m is None:
         raise InputError(
-            f"{name}: nobody states how accurate these heights are: state what they are off one by one "
-            "(--control-dem-sigma-m) and what the whole model is off in position and height "
-            "(--control-dem-frame-sigma-m HORIZONTAL,UP), one standard deviation in metres"
+            f"{name}: the accuracy of these heights is not stated: give the error of single heights "
+            "with --control-dem-sigma-m, and the common error of the whole model with "
+            "--control-dem-frame-sigma-m HORIZONTAL,UP, one standard deviation in metres"
         )
     try:
         terrain = read_terrain(heights.terrain)

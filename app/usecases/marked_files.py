@@ -50,9 +50,8 @@ def read_marked(
     """
     if points.frame_sigma_m is None:
         raise InputError(
-            f"{paths[0].name}: nobody states how well the frame of these points is known on the Earth, "
-            "the error that all of them share: state it (--control-frame-sigma-m HORIZONTAL,UP), such "
-            "as 0.05,0.05 for points measured by GNSS in the ITRF"
+            f"{paths[0].name}: the common error of these points on the Earth is not stated: give it "
+            "with --control-frame-sigma-m HORIZONTAL,UP, e.g. 0.05,0.05 for GNSS"
         )
     names, files = [], []
     image: list[IntArray] = []

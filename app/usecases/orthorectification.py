@@ -144,9 +144,9 @@ class MapLimits:
         most = MOST_MAP_PIXELS * math.prod(scene.image.shape)
         if lines * samples > most:
             raise InputError(
-                f"the map would have {lines} x {samples} pixels, at most {most:,} are allowed, "
-                f"{MOST_MAP_PIXELS} times those of the scene: give a larger `gsd_m`, or a crs for this "
-                "part of the world"
+                f"the map would have {lines} x {samples} pixels, at most {most:,} are allowed "
+                f"({MOST_MAP_PIXELS} times the pixels of the scene): give a larger `gsd_m`, or a crs "
+                "for this part of the world"
             )
         # A third more with overviews; compression makes it smaller.
         size_bytes = lines * samples * pixel_bytes * 4 // 3
@@ -354,7 +354,7 @@ def _run(work: Work) -> Commit:
 ORTHORECTIFY = Process(
     id="orthorectify",
     title="Orthorectify a scene",
-    description="Resample an uploaded scene to a map, by its model and a terrain uploaded beside it.",
+    description="Resample an uploaded scene to a map, by its model and a terrain uploaded with it.",
     scope=Scope.REGISTER,
     inputs=OrthorectifyScene,
     outputs={ORTHO_NAME: "The scene on the map, a cloud-optimised GeoTIFF."},

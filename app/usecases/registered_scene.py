@@ -67,8 +67,8 @@ def read_raw_scene(files: SceneModel) -> tuple[Scene, CorrectionAccuracy | None]
     model = scene.model.base if isinstance(scene.model, CorrectedModel) else scene.model
     if isinstance(model, OrthoModel):
         raise InputError(
-            f"{files.image}: has a map grid, a raw image with a sensor model is expected; what is drawn "
-            "on it is on the map already"
+            f"{files.image}: has a map grid, a raw image with a sensor model is expected; vectors drawn "
+            "on an ortho-image are on the map already"
         )
     return scene, accuracy
 

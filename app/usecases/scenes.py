@@ -201,15 +201,15 @@ def side_file_name(scene: SceneRow, name: str) -> str:
         raise Conflict(f"{file_name}: the files of scene {scene.id} lie on the server; put it there")
     if not file_name.lower().endswith(SIDE_FILE_SUFFIXES):
         raise InputError(
-            f"{file_name}: unexpected suffix; a file beside an image has one of "
+            f"{file_name}: unexpected suffix; a file that accompanies an image has one of "
             f"{', '.join(SIDE_FILE_SUFFIXES)}"
         )
     if file_name == scene.file_name:
         raise Conflict(f"{file_name} is the image of the scene; choose another name")
     if len(scene.models) >= MOST_SIDE_FILES and file_name not in scene.models:
         raise TooMany(
-            f"{file_name}: scene {scene.id} has {len(scene.models)} files beside its image, the most "
-            "that are allowed; send it under the name of a file that it replaces"
+            f"{file_name}: scene {scene.id} has {len(scene.models)} files in addition to its image, the "
+            "largest number allowed; send it under the name of a file that it replaces"
         )
     return file_name
 

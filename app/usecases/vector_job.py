@@ -256,7 +256,7 @@ _COUNTS: dict[str, dict[str, Any]] = {
     },
     "renamed": {
         "type": "object",
-        "title": "Attributes whose names the format keeps for itself, each with its new name",
+        "title": "Attributes with a name that the format reserves, each with its new name",
     },
 }
 
@@ -264,7 +264,7 @@ CORRECT_VECTORS = Process(
     id="correct-vectors",
     title="Correct vectors",
     description="Bring vectors that were drawn on an uploaded scene onto the map, by its model and a "
-    "terrain uploaded beside it, with the predicted accuracy of every vertex.",
+    "terrain uploaded with it, with the predicted accuracy of every vertex.",
     scope=Scope.REGISTER,
     inputs=CorrectVectors,
     outputs=_outputs(
@@ -287,7 +287,7 @@ PROJECT_VECTORS = Process(
     id="project-vectors",
     title="Project vectors",
     description="Bring vectors of the map into the pixel coordinates of an uploaded scene, by its model "
-    "and a terrain uploaded beside it, with the vertices that the ground hides.",
+    "and a terrain uploaded with it, and name the vertices that the ground hides.",
     scope=Scope.REGISTER,
     inputs=ProjectVectors,
     outputs=_outputs(

@@ -114,7 +114,7 @@ def earth_frames(
 ) -> tuple[Frame, ...]:
     """The frames of the groups of a block on the Earth.
 
-    Images of one pass share orbit, attitude and clock, to an extent that nobody states: shared errors
+    Images of one pass share orbit, attitude and clock, to an unknown extent: shared errors
     weaken the position and strengthen the height. With the covariance F0 for images that share nothing
     and F1 for images that share all, the frame is F0 + (F1 - F0)+, which covers both.
 

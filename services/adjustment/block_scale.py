@@ -132,7 +132,7 @@ def check_scale(scale: float) -> None:
     """
     if scale > MAX_SCALE:
         raise NoConsensus(
-            f"the residuals of the tie points are {scale:.1f} times as large as their sigmas say, at "
-            f"most {MAX_SCALE:g} is credible: state larger sigmas, allow drifts of the images, or "
+            f"the residuals of the tie points are {scale:.1f} times their sigmas, at most "
+            f"{MAX_SCALE:g} times is credible: give larger sigmas, allow drifts of the images, or "
             "remove wrong tie points"
         )

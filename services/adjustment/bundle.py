@@ -107,7 +107,7 @@ def adjust_block(
         control: known ground positions of some of the points.
         neighbour: images of an adjusted block, some of which are images of this one: what it tells of
             their parameters is observed, and what they observe of their common points is not used again.
-        passes: masks (n,) of images that may share errors, as those of one pass do; nobody states how
+        passes: masks (n,) of images that may share errors, such as those of one pass; it is unknown how
             much, and the frames cover every share.
         options: thresholds.
         like: an adjustment of these images on these observations and others, whose scale and drifts
@@ -115,7 +115,7 @@ def adjust_block(
 
     Raises:
         InputError: the neighbour has no image of the block, or one with another model; control points
-            are of another scene; ortho-images alone have heights whose common error nobody states.
+            are of another scene; the common error of the heights of ortho-images alone is not stated.
         NotEnoughPoints: too few points can be intersected.
         NoConsensus: the residuals are too large for the sigmas of the observations, or most control
             points disagree.
@@ -253,14 +253,14 @@ def _slope_factor(values: Array, priors: BlockPriors, determined: Array, so_far:
 
 
 def _check_heights(problem: BlockProblem) -> None:
-    """Refuse a block of ortho-images alone whose heights have an error that nobody states."""
+    """Refuse a block of ortho-images alone where the common error of their heights is not stated."""
     control = problem.control
     stated = [np.isfinite(frame.covariance_m2[2, 2]) for frame in control.frames]
     known = control.known[:, 2] & np.array(stated, dtype=np.bool_)[control.source]
     if problem.flat.all() and control.known[:, 2].any() and not known.any():
         raise InputError(
-            "the heights of ortho-images alone come from elevation models, and nobody states how far "
-            "off these are as a whole: state it (--control-dem-frame-sigma-m HORIZONTAL,UP)"
+            "the heights of ortho-images alone come from elevation models, whose common error is not "
+            "stated: give it with --control-dem-frame-sigma-m HORIZONTAL,UP"
         )
 
 

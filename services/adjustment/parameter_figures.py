@@ -71,7 +71,7 @@ def held_parameters(figures: Sequence[ParameterFigure]) -> tuple[str, ...]:
             for figure in of_image
         ]
         sentences.append(
-            f"{name}: the observations do not determine {', '.join(named)}: held by the a priori "
-            "accuracy. More control points, farther apart, would determine more"
+            f"{name}: the observations do not determine {', '.join(named)}; the a priori accuracy "
+            "limits them. Add control points, farther apart"
         )
     return tuple(sentences)

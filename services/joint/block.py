@@ -285,7 +285,7 @@ def _frames(scenes: Sequence[MeasuredScene], block: IntArray) -> tuple[Frame, ..
     """The frames of blocks of control points, as seen from the block of most of them.
 
     What the block of most points is off by is not seen. Another one lies apart by the errors of both;
-    where nobody stated them, by a pixel, as for one scene alone.
+    where these are not stated, by a pixel, as for one scene alone.
     """
     stated = scenes[0].points.frames
     if not len(block):

@@ -174,8 +174,8 @@ def _why(fits: Sequence[SceneFit], number: int) -> str:
             "changes, or a wrong model"
         )
     return (
-        f"its residuals are {ratio:.1f} times those of the middle scene, at most {LARGEST_RATIO:g} "
-        "expected: its model is bent, or not that of the image"
+        f"its residuals are {ratio:.1f} times the median of the scenes, at most {LARGEST_RATIO:g} times "
+        "expected: its model is bent, or belongs to another image"
     )
 
 

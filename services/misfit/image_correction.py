@@ -440,7 +440,8 @@ def _refuse_undetermined(fit: AffineFit, active: BoolArray, order: Order) -> Non
             raise UndeterminedCorrection(
                 f"the {int(active.sum())} points lie on a line, {width:.1g} half sizes of the image "
                 f"wide, which does not determine the order {order!r} (at least {_THIN:g} expected): "
-                "give the order 'shift', or none: what no point determines is then expected to be small"
+                "give the order 'shift', or none, so that parameters which no point determines stay "
+                "small"
             )
 
 

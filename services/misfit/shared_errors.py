@@ -43,7 +43,7 @@ _CLIPPED_VARIANCE = float(
 _ENOUGH = 250
 """Measures that tell share and length; more cost more and tell no more."""
 _UNKNOWN_OFFSET_PX = 1.0
-"""A priori standard deviation of the offset of a block whose frame nobody stated."""
+"""A priori standard deviation of the offset of a block whose frame is not stated."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def offset_sigma_px(
         free: (2, 3) parameters of the correction.
         slope_px: a priori standard deviation of drift and skew.
         unit: standard deviation of unit weight.
-        stated_px: (2, b) of the frames of the blocks; NaN where nobody stated it.
+        stated_px: (2, b) of the frames of the blocks; NaN where it is not stated.
 
     Returns:
         (2, b) a priori, and what the blocks were seen to be apart beyond chance.

@@ -108,7 +108,7 @@ def _image_fit(
     measures, used = count
     odd = []
     if used < _FEWEST:
-        odd.append(f"{used} measures: more common ground would hold it")
+        odd.append(f"{used} measures: it needs more common ground with other images")
     if used < _LEAST_USED * measures:
         odd.append(
             f"{measures - used} of {measures} measures disagree: clouds, changes or a wrong model"
@@ -116,7 +116,7 @@ def _image_fit(
     if sigmas > MAX_ERROR_SIGMAS:
         odd.append(f"off by {sigmas:.1f} times the accuracy stated for it")
     if ratio > _LARGEST_RATIO:
-        odd.append(f"residuals {ratio:.1f} times those of the middle image: its model is bent")
+        odd.append(f"residuals {ratio:.1f} times the median of the images: its model is bent")
     return ImageFit(
         name=scene.acquisition.image_id,
         measures=measures,

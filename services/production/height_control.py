@@ -114,9 +114,10 @@ def known_heights(
             len(rows),
             _MIN_FOUND,
             f"points on smooth ground of the elevation model {heights.name}: {len(lon_lat_h)} tried, "
-            f"{int(np.isfinite(rough_m).sum())} where it has heights, {int(smooth.sum())} of them not "
-            f"steep nor rougher than {_ROUGHEST:g} times its sigma of {heights.sigma_m:g} m "
-            "(--control-dem-sigma-m); at others the images show no smooth surface",
+            f"{int(np.isfinite(rough_m).sum())} where it has heights, {int(smooth.sum())} of them on "
+            f"ground that is not steep and not rougher than {_ROUGHEST:g} times its sigma of "
+            f"{heights.sigma_m:g} m (--control-dem-sigma-m); the images show no smooth surface at the "
+            "others",
         )
     mean = slope[rows].mean(axis=0)
     own_m2 = heights.sigma_m**2 + rough_m**2 + above.sigma_m**2

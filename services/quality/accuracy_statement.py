@@ -119,7 +119,7 @@ def vertices_accuracy(
     if frame is None:
         relative = "none: the scene is not registered"
         if np.isnan(worst_on_the_earth_m):
-            earth = f"{earth}: the scene is not registered, and nobody stated the accuracy of its model"
+            earth = f"{earth}: the scene is not registered, and the accuracy of its model is not stated"
     else:
         earth = _with_reason(earth, frame)
     return AccuracyStatement(

@@ -140,7 +140,7 @@ class HeightQuality:
         normalised: the errors without their mean, in units of what is declared for them.
         typical_ratio: the same without the influence of outliers, as a ratio: their NMAD.
         normalised_frame: the median error in units of the declared frame of the block and of the model;
-            n is 0 when nobody declared the frame.
+            n is 0 where the frame is not declared.
         cells: by cell of one degree.
         land_cover: by land cover; empty when it is not given.
     """

@@ -14,10 +14,10 @@ BlockVerdict = Literal["met", "not shown", "missed", "not specified"]
 
 VERDICT_WORDS: dict[BlockVerdict, str] = {
     "met": "The block meets its specification.",
-    "not shown": "Nothing contradicts the specification, but what was measured does not show that the "
-    "block meets all of it.",
+    "not shown": "No measurement contradicts the specification, but the measurements do not prove that "
+    "the block meets all of it.",
     "missed": "The block misses its specification.",
-    "not specified": "Nobody stated what the block shall reach.",
+    "not specified": "No required accuracy or density was given.",
 }
 
 
@@ -26,11 +26,11 @@ class BlockRequirements:
     """What a block shall reach.
 
     Attributes:
-        points_per_km2: density of every cell of 0.1 degree; None where nobody specified it.
+        points_per_km2: density of every cell of 0.1 degree; None where it is not specified.
         min_share: share of the ground, by cells, that shall reach the density, 0 to 1.
         min_views: number of images that shall show every point.
-        ce90_m: largest CE90 on the Earth; None where nobody specified it.
-        le90_m: largest LE90 of the heights on the Earth; None where nobody specified it.
+        ce90_m: largest CE90 on the Earth; None where it is not specified.
+        le90_m: largest LE90 of the heights on the Earth; None where it is not specified.
     """
 
     points_per_km2: float | None = None

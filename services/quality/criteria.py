@@ -64,7 +64,7 @@ _DESCRIPTIONS = {
         "Coverage of the image",
         "%",
         0,
-        "Cells of the image that hold an active point, as a share of all cells.",
+        "Share of the cells of the image that contain an active point.",
     ),
     "active_of_matched": _Description(
         "Active / matched", "", 2, "Active points divided by matched points."
@@ -74,9 +74,9 @@ _DESCRIPTIONS = {
         "px",
         2,
         "Standard deviation of the active residuals (n - 1 in the denominator), the larger of x and y, "
-        "without the part that chance and the accuracy of the points explain: as stated for good, as "
-        "the scene shows it for usable, at most what separates neighbouring points. The limit of "
-        "usable is in pixels of the chips where these are coarser.",
+        "minus the part that chance and the errors of the points explain. For good, these errors are as "
+        "stated; for usable, as estimated in the scene; never more than the differences between "
+        "neighbouring points. The limit of usable is in pixels of the chips where these are coarser.",
     ),
     "displacement_px": _Description(
         "Displacement with fewer points",
@@ -89,16 +89,16 @@ _DESCRIPTIONS = {
         "Predicted CE90, worst place",
         "px",
         2,
-        "The covariance of the correction is propagated to a grid over the image. Radius that holds "
-        "90 % of its normal law, largest of the grid.",
+        "The covariance of the correction is propagated to a grid over the image. Radius that contains "
+        "90 % of the errors by the normal law, largest of the grid.",
     ),
     "ce90_on_earth_m": _Description(
         "CE90 on the Earth, worst place",
         "m",
         2,
-        "The covariance of the correction, and that of the frame of the control points through the "
-        "derivative of the model, on the ground at its true height. Radius that holds 90 % of the "
-        "normal law, largest of the grid. The option max_ce90_on_earth_m sets the limit.",
+        "The covariance of the correction and that of the control points' frame, propagated to the "
+        "ground at its true height. Radius that contains 90 % of the errors by the normal law, largest "
+        "of the grid. The option max_ce90_on_earth_m sets the limit.",
     ),
     "unit_weight": _Description(
         "Standard deviation of unit weight",
@@ -118,99 +118,99 @@ _DESCRIPTIONS = {
         "Residuals along the lines",
         "px",
         2,
-        "Largest displacement by a swing or bend along the lines that residuals show; 0 where chance "
-        "shows one as clearly (F test of the best shape, times the number tried, 0.0001). The limit is "
-        "a tenth of the predicted CE90.",
+        "Largest displacement of an oscillation or bend along the lines in the residuals; 0 if it could "
+        "be chance (F test, corrected for the number of shapes, p > 0.0001). The limit is a tenth of "
+        "the predicted CE90.",
     ),
     "steps_along_lines": _Description(
         "Steps along the lines",
         "px",
         2,
-        "Largest step of the residuals at some line; 0 where chance shows one as clearly. The limit is "
-        "a tenth of the predicted CE90.",
+        "Largest step of the residuals at a line; 0 if it could be chance. The limit is a tenth of the "
+        "predicted CE90.",
     ),
     "structure_along_samples": _Description(
         "Residuals along the samples",
         "px",
         2,
-        "Largest displacement by a swing or bend along the samples that residuals show; 0 where chance "
-        "shows one as clearly. Seams between detectors and distortions of the optics show here. The "
+        "Largest displacement of an oscillation or bend along the samples in the residuals; 0 if it "
+        "could be chance. Possible causes: seams between detectors, distortions of the optics. The "
         "limit is half of the predicted CE90 for good, twice it for usable.",
     ),
     "steps_along_samples": _Description(
         "Steps along the samples",
         "px",
         2,
-        "Largest step of the residuals at some sample, a seam between two detectors; 0 where chance "
-        "shows one as clearly. Limits as for residuals along the samples.",
+        "Largest step of the residuals at a sample, such as a seam between two detectors; 0 if it could "
+        "be chance. Limits as for residuals along the samples.",
     ),
     "structure_in_image": _Description(
         "Residuals over the image",
         "px",
         2,
-        "Largest displacement by waves in two dimensions that residuals show; 0 where chance shows one "
-        "as clearly. Limits as for residuals along the samples.",
+        "Largest displacement of a wave in two dimensions in the residuals; 0 if it could be chance. "
+        "Limits as for residuals along the samples.",
     ),
     "structure_against_height": _Description(
         "Residuals against height",
         "px",
         2,
-        "Largest displacement that grows with the height of the points, as where the lines of sight of "
-        "the model are not those of the image; 0 where chance shows one as clearly.",
+        "Largest displacement that grows with the height of the points; 0 if it could be chance. It "
+        "appears where the lines of sight of the model differ from those of the image.",
     ),
     "correction_against_height": _Description(
         "Correction up the slope of the ground",
         "%",
         2,
-        "The displacement of the points from the model before registration, and their heights, as "
-        "planes over the image: growth of the first up the slope of the second, less two standard "
-        "deviations, as a share of the distance. 0 where it grows as much across the slope, or "
-        "where no other view of the place explains it.",
+        "A plane is fitted to the displacements of the points from the model before registration, and "
+        "one to their heights. Growth of the displacement up the slope of the ground, minus two "
+        "standard deviations, in percent of the distance. 0 if it grows as much across the slope, or if "
+        "no other view of the place explains it.",
     ),
     "line_of_sight": _Description(
         "Line of sight",
         "deg",
         1,
-        "Slopes shear the chips of a point against the scene, by how differently both see the ground. "
-        "Angle between the line of sight that shears of all chips imply and that of the model; 0 where "
-        "chance explains it (probability above 0.00001).",
+        "On slopes, chips are sheared against the scene when both see the ground from different "
+        "directions. Angle between the line of sight that the shears of all chips imply and that of the "
+        "model; 0 if it could be chance (p > 0.00001).",
     ),
     "structure_within_chips": _Description(
         "Motion within the chips",
         "px",
         2,
-        "Largest displacement by a swing over fewer lines than a chip has, by which parts of the chips "
-        "at the same lines are displaced alike (F test, as along the lines). The limit of good is half "
-        "of the predicted CE90, which holds it.",
+        "Largest displacement of an oscillation that is shorter than a chip: parts of different chips "
+        "at the same lines are displaced by the same amount (F test, as along the lines). The limit of "
+        "good is half of the predicted CE90, which includes this displacement.",
     ),
     "lines_behind_breaks": _Description(
         "Lines behind breaks of the image",
         "%",
         0,
-        "Where lines are missing or repeated, neighbouring lines differ over the width of the image by "
-        "more than elsewhere (1.4 times at least; chance makes 0.0001 such places). Lines of the parts "
-        "between these breaks that fewer than three active points hold, as a share of all lines.",
+        "Where lines are missing or repeated, neighbouring lines differ more over the width of the "
+        "image than elsewhere: 1.4 times or more (0.0001 such places expected by chance). Share of the "
+        "lines that lie in parts, between these breaks, with fewer than three active points.",
     ),
     "missed_along_lines": _Description(
         "Lines whose points do not agree",
         "%",
         0,
-        "Lines between which hardly any of the points tried agree with the scene, fewer than chance "
-        "explains (binomial, times the number of intervals, 0.01), as a share of all lines. Points "
-        "under clouds and where pixels are missing do not count. Usable up to 10 %.",
+        "Share of the lines that lie in intervals where almost no point agrees with the scene, fewer "
+        "than chance explains (binomial test, corrected for the number of intervals, p < 0.01). Points "
+        "under clouds and on missing pixels do not count. Usable up to 10 %.",
     ),
     "missed_along_samples": _Description(
         "Samples whose points do not agree",
         "%",
         0,
-        "As for the lines, between samples: detectors out of place show here. Usable up to 10 %.",
+        "The same for samples. Possible cause: a detector out of place. Usable up to 10 %.",
     ),
     "points_elsewhere": _Description(
         "Points that agree elsewhere",
         "",
         0,
-        "Points that were not found where they are expected are searched again in a wide window. Number "
-        "of those that agree on another displacement, beyond chance.",
+        "Points that were not found at their expected places are searched again in a wide window. "
+        "Number of these points that agree on another displacement, more than chance explains.",
     ),
     "check_points": _Description(
         "Normalised error at check points",
@@ -259,6 +259,6 @@ def verdict_of(criteria: tuple[Criterion, ...]) -> Verdict:
 
 
 def verdict_scope(criteria: tuple[Criterion, ...]) -> str:
-    """The accuracy that a verdict speaks of: that of every place which states both."""
+    """The accuracies that a verdict is about, in words."""
     on_the_earth = any(criterion.name == "ce90_on_earth_m" for criterion in criteria)
     return f"relative to the control points{' and on the Earth' if on_the_earth else ''}"

@@ -60,10 +60,12 @@ def frame_in_image(frame: Frame, derivative: Array, apart_px: float) -> Array:
 
 
 def why_unknown(frame: Frame) -> str:
-    """What nobody stated of a frame; "" when it is stated completely."""
+    """Which part of the accuracy of a frame is not stated; "" when all of it is."""
     unknown = np.isnan(np.diagonal(frame.covariance_m2))
     if unknown.all():
-        return "nobody stated the frame of the control points"
+        return "the accuracy of the control points' frame is not stated"
     if unknown[2]:
-        return "nobody stated the height of the control points' frame"
-    return "nobody stated the horizontal part of the control points' frame" if unknown.any() else ""
+        return "the height accuracy of the control points' frame is not stated"
+    if unknown.any():
+        return "the horizontal accuracy of the control points' frame is not stated"
+    return ""

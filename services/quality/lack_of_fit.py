@@ -38,8 +38,8 @@ or repeated rather than ground moved."""
 _ALONG = 0.1
 """Displacement along the samples over that along the lines, up to which lines alone were displaced."""
 _MOVED = (
-    "others beside them do not: ground that moved (a landslide, a quarry, ice), or a part of another "
-    "image"
+    "points next to them do not. Possible causes: ground that moved (a landslide, a quarry, ice), or a "
+    "part of another image"
 )
 _OF_A_PLANE = 3
 """Parameters of a plane."""
@@ -48,8 +48,8 @@ _ENOUGH = 4
 _MISSED_PERCENT = 10.0
 """Share of the lines, or samples, whose points do not agree, beyond which the scene is not usable."""
 _WHY_MISSED = {
-    "lines": "lines were lost or repeated, the sensor swung by more than the search reaches",
-    "samples": "a detector is out of place, an image was put together from parts",
+    "lines": "lines were lost or repeated, the sensor oscillated by more than the search radius",
+    "samples": "a detector is out of place, the image was put together from parts",
 }
 _LARGE_PART = 0.4
 """Share of the image to which points that agree elsewhere are nearest, beyond which neither place is the
@@ -100,12 +100,13 @@ class Elsewhere:
 def structure_criteria(
     structures: Sequence[Structure], sight: Array, shape: tuple[int, int], predicted_px: float
 ) -> list[Criterion]:
-    """A criterion for each family of structures: what chance does not explain has to be small.
+    """A criterion for each family of structures: structures beyond chance have to be small.
 
-    A structure that is larger than the stated accuracy makes this wrong: no usable registration has it.
-    What the profile should follow and does not is held to a tenth of it: points on the other side of a
-    step, or at the crest of a wave, were left out of what is seen. A model of other lines of sight is
-    wrong wherever the ground has other heights than the points: it is not usable.
+    A structure that is larger than the predicted accuracy makes the prediction wrong: the registration
+    is not usable. Structures that the profile should follow are limited to a tenth of the prediction,
+    because points on the other side of a step, or at the crest of a wave, are not among the active
+    points. A model with other lines of sight is wrong wherever the ground has other heights than the
+    points: the registration is not usable.
 
     Args:
         structures: of the residuals of the final adjustment.
@@ -126,16 +127,16 @@ def structure_criteria(
             grade, limit_px = "usable", _USABLE * predicted_px
         criterion = at_most(_CRITERIA[structure.family], size_px, float(np.nan_to_num(limit_px)), grade)
         if not criterion.met:
-            seen = f"chance shows it with a probability of {structure.chance:.1g}"
-            criterion = replace(criterion, note=f"{_looks_like(structure, sight, shape)}; {seen}")
+            described = f"{_looks_like(structure, sight, shape)} (p = {structure.chance:.1g})"
+            criterion = replace(criterion, note=described)
         criteria.append(criterion)
     return criteria
 
 
 def breaks_criterion(breaks: IntArray, line: Array, followed: bool, lines: int) -> Criterion:
-    """The criterion on lines between breaks of an image of which too few points say where they lie.
+    """The criterion on lines between breaks of an image in parts with too few points.
 
-    They may lie anywhere, so that no usable scene has any.
+    The position of such a part is unknown, so that no usable scene has one.
 
     Args:
         breaks: (k,) first lines behind breaks, one at least.
@@ -171,9 +172,9 @@ def missed_criterion(
     misfit_px: Array | None = None,
     counts: BoolArray | None = None,
 ) -> Criterion:
-    """The criterion on lines, or samples, whose points do not agree, where those of others do.
+    """The criterion on lines, or samples, in which almost no point agrees with the scene.
 
-    Of samples, and at the borders, points that were found count alone: haze or water may hide a side
+    For samples, and at the borders, only points that were found count: haze or water may hide one side
     of an image.
 
     Args:
@@ -206,9 +207,10 @@ def missed_criterion(
         name, percent, _MISSED_PERCENT if severe else 0.0, "usable" if severe else "good"
     )
     seen = (
-        f"of {int(missed.sum())} points tried between {along} {first:.0f} and {last:.0f}, "
-        f"{int((missed & active).sum())} agree with the scene, of {int(beside.sum())} others "
-        f"{int((beside & active).sum())}: {_WHY_MISSED[along]}, or what these {along} show has changed"
+        f"between {along} {first:.0f} and {last:.0f}, {int((missed & active).sum())} of "
+        f"{int(missed.sum())} points tried agree with the scene, elsewhere "
+        f"{int((beside & active).sum())} of {int(beside.sum())}. Possible causes: {_WHY_MISSED[along]}, "
+        "or the ground has changed there"
     )
     return replace(criterion, note=seen)
 
@@ -234,8 +236,8 @@ def against_height(elsewhere: Elsewhere | None, sight: Array, predicted_px: floa
     criterion = at_most("structure_against_height", elsewhere.farthest_px, limit_px, "usable")
     seen = (
         f"{len(elsewhere.rows)} points that do not agree with the scene are displaced in proportion to "
-        f"their heights, by up to {elsewhere.farthest_px:.1f} px, of which chance makes "
-        f"{elsewhere.false_alarms:.1g}"
+        f"their heights, by up to {elsewhere.farthest_px:.1f} px ({elsewhere.false_alarms:.1g} such "
+        "groups expected by chance)"
     )
     return replace(criterion, note=f"{seen}; {_wrong_sight(elsewhere.slope_px, sight)}")
 
@@ -245,10 +247,10 @@ def correction_against_height(
 ) -> Criterion:
     """The criterion on a correction that grows up the slope of the ground, and hardly across it.
 
-    The relief of a slope moves points in proportion to their heights where the model is that of another
-    view. An affine follows it, so that no residual tells; but beyond the points, and wherever the ground
-    leaves their plane, it is wrong. Where points leave it, and stay where the correction has them, it is
-    a drift that happens to run up the slope.
+    Where the model belongs to another view, relief moves points in proportion to their heights. On a
+    slope an affine follows this, so that the residuals do not show it; but the correction is wrong
+    beyond the points, and wherever the ground leaves their plane. Points that leave the plane and still
+    fit the correction show that it is a drift that happens to run up the slope.
 
     Args:
         displacement_px: (n, 2) of the active points from where the model was before registration.
@@ -279,8 +281,8 @@ def correction_against_height(
     seen = (
         f"the correction grows by {percent:.2f} % of the distance up the slope of the ground, and by "
         f"{across:.2f} % across it, as if seen {np.degrees(np.arctan(lean)):.0f} degrees from the lines "
-        "of sight of the model: the model is that of another view, or the heights of the points have "
-        "another datum or scale"
+        "of sight of the model. Possible causes: the model belongs to another view, or the heights of "
+        "the points have another datum or scale"
     )
     return replace(criterion, note="" if criterion.met else seen)
 
@@ -321,8 +323,8 @@ def elsewhere_criterion(
     moved = (
         f"{len(line)} points of lines {first:.0f} to {last:.0f} agree on a place "
         f"{np.hypot(*elsewhere.displacement_px):.1f} px ({elsewhere.displacement_m:.1f} m) away "
-        f"({elsewhere.displacement_px[0]:+.1f} lines, {elsewhere.displacement_px[1]:+.1f} samples), "
-        f"of which chance makes {elsewhere.false_alarms:.1g}"
+        f"({elsewhere.displacement_px[0]:+.1f} lines, {elsewhere.displacement_px[1]:+.1f} samples; "
+        f"{elsewhere.false_alarms:.1g} such groups expected by chance)"
     )
     broken = _broken_by(some, others, elsewhere.displacement_px, shape)
     criterion = at_most("points_elsewhere", len(line), 0, "usable" if broken else "good")
@@ -333,25 +335,28 @@ def _broken_by(some: Array, others: Array, displacement_px: Array, shape: tuple[
     """How points (n, 2) that agree elsewhere than others (m, 2) break an image; "" by moved ground."""
     if _belong_to_whole_lines(some[:, 0], others[:, 0], displacement_px):
         return (
-            "hardly any others lie between these lines: lines of the image were lost or repeated, or "
-            "belong to another image"
+            "almost no other point lies between these lines: lines of the image were lost or repeated, "
+            "or belong to another image"
         )
     sample, samples_of_others = some[:, 1], others[:, 1]
     by_chance = chance_of_contiguous(sample, samples_of_others)
     if are_contiguous(sample, samples_of_others) and by_chance <= _CHANCE_OF_SAMPLES:
         return (
-            f"hardly any others lie between their samples, {sample.min():.0f} to {sample.max():.0f}: a "
-            "detector is out of place, or the image was put together from parts"
+            f"almost no other point lies between their samples, {sample.min():.0f} to "
+            f"{sample.max():.0f}: a detector is out of place, or the image was put together from parts"
         )
     among = float(np.mean(shapely.contains_xy(shapely.MultiPoint(some).convex_hull, others)))
     if among > _AMONG and len(some) > _AS_MANY * len(others):
         return (
-            f"{among:.0%} of the others lie between them: detectors that alternate, or an image put "
-            "together from parts, so that neither place is the scene's"
+            f"{among:.0%} of the other points lie among them: detectors alternate, or the image was put "
+            "together from parts, so that neither place is that of the whole scene"
         )
     part = _nearest_share(some, others, shape)
     if part > _LARGE_PART:
-        return f"{_MOVED}; they are nearest to {part:.0%} of the image: neither place is the scene's"
+        return (
+            f"{_MOVED}. They are the nearest points for {part:.0%} of the image, so that neither place "
+            "is that of the whole scene"
+        )
     return ""
 
 
@@ -401,30 +406,36 @@ def _looks_like(structure: Structure, sight: Array, shape: tuple[int, int]) -> s
         return _wrong_sight(structure.slope_px, sight)
     if structure.family == "chips":
         return (
-            f"parts of chips move against each other by {size}, most clearly over {structure.at:.0f} "
-            "lines: attitude jitter too fast for positions of whole chips, which no correction follows; "
-            "the predicted accuracy holds it"
+            f"parts of chips are displaced against each other by {size}, most clearly with a period of "
+            f"{structure.at:.0f} lines. Possible cause: attitude jitter that is shorter than a chip. No "
+            "correction follows it; the predicted accuracy includes it"
         )
     if structure.shape == "step":
         where, cause = "line", "lines that were lost or repeated"
         if structure.family == "seams":
             where, cause = "sample", "a seam between detectors"
-        return f"a step of {size} at {where} {structure.at:.0f}: {cause}"
+        return (
+            f"the residuals have a step of {size} at {where} {structure.at:.0f}. Possible cause: {cause}"
+        )
     if structure.family == "image":
         return (
-            f"neighbours are displaced together by {size}: relief that is not in the model, or terrain"
+            f"neighbouring points are displaced together by {size}. Possible cause: errors of the "
+            "terrain, or relief that the model does not have"
         )
     along = "lines" if structure.family == "lines" else "samples"
     if structure.shape != "period":
         cause = "a bow of the attitude" if along == "lines" else "a bent detector line"
-        return f"residuals bend along the {along} by {size}: {cause} that no correction follows"
+        return (
+            f"a bend of {size} along the {along} remains in the residuals. Possible cause: {cause}; the "
+            "correction does not follow it"
+        )
     length = shape[0] if along == "lines" else shape[1]
     cause = "seams between detectors, or a distortion of the optics"
     if along == "lines":
         cause = "a bow of the attitude" if structure.at > length else "attitude jitter"
     return (
-        f"residuals swing along the {along} by {size} over {structure.at:.0f} {along}: {cause} that no "
-        "correction follows"
+        f"an oscillation of {size} along the {along}, with a period of {structure.at:.0f} {along}, "
+        f"remains in the residuals. Possible cause: {cause}; the correction does not follow it"
     )
 
 
@@ -433,7 +444,7 @@ def _wrong_sight(slope_px: Array, sight: Array) -> str:
     slope = float(np.hypot(*slope_px))
     share = slope / max(float(np.hypot(*sight)), 1e-9)
     return (
-        f"residuals grow by {100.0 * slope:.2f} px for 100 m of height, {share:.0%} of what the relief "
-        "moves in this model: the model is that of another view, or the heights of the points have "
-        "another datum or scale"
+        f"residuals grow by {100.0 * slope:.2f} px for 100 m of height, {share:.0%} of the displacement "
+        "by relief in this model. Possible causes: the model belongs to another view, or the heights of "
+        "the points have another datum or scale"
     )

@@ -224,9 +224,9 @@ def line_of_sight_criterion(sight: ImpliedSight | None) -> Criterion:
         return at_most(name, 0.0, _LARGEST_DEG, "usable")
     criterion = at_most(name, sight.angle_deg, _LARGEST_DEG, "usable")
     seen = (
-        f"slopes shear the chips of {sight.points} points as seen {sight.angle_deg:.0f} degrees "
-        f"(standard deviation {sight.sigma_deg:.0f}) from the lines of sight of the model, which chance "
-        f"shows with a probability of {sight.chance:.1g}: the model is that of another view, or those "
-        "of the images of the points are"
+        f"the chips of {sight.points} points are sheared on slopes as if seen {sight.angle_deg:.0f} "
+        f"degrees (standard deviation {sight.sigma_deg:.0f}) from the lines of sight of the model "
+        f"(p = {sight.chance:.1g}). Possible causes: the model of the scene belongs to another view, or "
+        "a model of the images that the chips come from does"
     )
     return replace(criterion, note="" if criterion.met else seen)

@@ -90,7 +90,7 @@ class PlanimetricQuality:
             a normal law.
         shift_east_m, shift_north_m: the median shift.
         normalised_frame: that shift in units of the declared frame of the block and of the ortho-images;
-            n is 0 when nobody declared the frame.
+            n is 0 where the frame is not declared.
     """
 
     source: Source

@@ -431,7 +431,7 @@ def _behind_breaks(scene: AdjustedScene) -> list[Criterion]:
 
 
 def _on_earth(predicted: PredictedAccuracy, limit_m: float, frame: Frame) -> Criterion:
-    """The criterion on the Earth, which a user asks for; a frame that nobody stated does not meet it."""
+    """The optional criterion on the Earth; a frame without stated accuracy does not meet it."""
     criterion = at_most("ce90_on_earth_m", predicted.on_the_earth_worst_m, limit_m, "usable")
     unknown = "" if np.isfinite(criterion.value) else f"unknown: {why_unknown(frame)}"
     return replace(criterion, note=unknown)

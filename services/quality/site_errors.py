@@ -23,7 +23,7 @@ from amers.services.types import (
 
 POINTS = "points"
 UNKNOWN_FRAME_SIGMA_M = 10.0
-"""Sigma of the frame of a block, for the width of the search, where nobody stated it."""
+"""Sigma of the frame of a block, for the width of the search, where it is not stated."""
 _NEAR_PX = 12
 """Search radius around the shift that the points of a site share, chip pixels."""
 _FARTHEST_PX = 150

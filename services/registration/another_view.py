@@ -25,7 +25,7 @@ def another_view(
         predicted, measured: (n, 2) where they are expected and found, pixels; NaN where not found.
 
     Returns:
-        A sentence for the refusal; "" where there is nothing to tell.
+        A sentence for the refusal; "" if no other view is found.
     """
     if sees_nothing(stage):
         return next_step(stage, scene.sigma_m)
@@ -42,6 +42,6 @@ def another_view(
         return ""
     return (
         f"{int(agrees.sum())} of them agree if displacements may change along the image and with their "
-        f"heights, of which chance makes {false_alarms:.1g}: the model is that of another view; give "
-        "the model that was delivered with this image"
+        f"heights ({false_alarms:.1g} such groups expected by chance). The model belongs to another "
+        "view: give the model that was delivered with this image"
     )

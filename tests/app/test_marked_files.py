@@ -158,7 +158,9 @@ def test_the_accuracy_of_an_ortho_image_is_that_of_its_product_or_stated(tmp_pat
         map_file(tmp_path, "map.tif"),
         map_file(tmp_path, "T33UUU_20190405T101031_B04.tif"),
     )
-    with pytest.raises(InputError, match=r"map\.tif: nobody states .*--control-ortho-sigma-m"):
+    with pytest.raises(
+        InputError, match=r"map\.tif: the accuracy .* is not stated: .*--control-ortho-sigma-m"
+    ):
         control_of(ControlFiles(orthos=(unknown,)))
     assert control_of(ControlFiles(orthos=(product,))).orthos[0].reference.frame.sigma_m > 5.0
     stated = control_of(ControlFiles(orthos=(unknown,), ortho_sigma_m=2.0)).orthos[0]
@@ -169,7 +171,7 @@ def test_the_accuracy_of_an_ortho_image_is_that_of_its_product_or_stated(tmp_pat
 @pytest.mark.parametrize(
     ("stated", "error", "message"),
     [
-        ({"sigma_m": None}, InputError, r"dem\.tif: nobody states .*--control-dem-sigma-m"),
+        ({"sigma_m": None}, InputError, r"dem\.tif: the accuracy .*--control-dem-sigma-m"),
         ({"frame_sigma_m": None}, InputError, r"--control-dem-frame-sigma-m HORIZONTAL,UP"),
         ({"vertical": None}, InputError, r"vertical datum.*--control-dem-vertical"),
     ],

@@ -200,7 +200,7 @@ def test_a_service_rectifies_a_scene_on_a_terrain_uploaded_beside_it(
     [
         ({"gsd_m": 0.05}, None, "InputError", "a finer map shows no more"),
         # A grid in links of 0.2 m: a step of as many units as the scene has metres is too small.
-        ({"crs": "EPSG:30200"}, None, "InputError", "16 times those of the scene"),
+        ({"crs": "EPSG:30200"}, None, "InputError", "16 times the pixels of the scene"),
         ({}, 300_000, "TooLarge", "left of the storage quota"),
     ],
 )

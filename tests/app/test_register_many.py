@@ -144,5 +144,5 @@ def test_nothing_is_written_when_a_folder_holds_other_files(
     (output / "block" / "mine.txt").write_text("mine")
     done = on_block(world, output, folder / "east.tif")
     assert done.returncode == 2
-    assert "block: holds files" in done.stderr
+    assert "block: contains files" in done.stderr
     assert [path.name for path in output.iterdir()] == ["block"]

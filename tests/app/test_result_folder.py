@@ -222,7 +222,7 @@ def test_two_runs_do_not_write_into_one_folder(tmp_path: Path):
 def test_a_work_folder_of_somebody_else_is_left_alone(tmp_path: Path):
     (tmp_path / ".out.amers-work" / "new").mkdir(parents=True)
     put_a_file(tmp_path / ".out.amers-work" / "new")
-    with pytest.raises(InputError, match=r"\.out\.amers-work: holds files that Amers did not write"):
+    with pytest.raises(InputError, match=r"\.out\.amers-work: contains files that Amers did not write"):
         write_result(tmp_path / "out", "new")
     assert (tmp_path / ".out.amers-work" / "new" / "notes.txt").exists()
 
@@ -257,7 +257,7 @@ def test_folders_that_cannot_be_replaced_are_refused_with_what_to_do(
     (tmp_path / "here" / "below").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "here" / "below")
     for folder in (Path(), Path(".."), tmp_path / "here"):
-        with pytest.raises(InputError, match=r"present folder.*-o .*registered"):
+        with pytest.raises(InputError, match=r"working folder.*-o .*registered"):
             older_result(folder)
     with pytest.raises(InputError, match="root of a volume"):
         older_result(Path("/proc"))

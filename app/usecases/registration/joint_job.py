@@ -183,8 +183,7 @@ REGISTER_SCENES = Process(
     id="register-scenes",
     title="Register scenes together",
     description="Refine the sensor models of uploaded scenes in one adjustment, on control points and "
-    "on tie points between the scenes. The outputs of each scene are those of register-scene, as "
-    "SCENE/NAME.",
+    "on tie points between the scenes. Each scene has the outputs of register-scene, as SCENE/NAME.",
     scope=Scope.REGISTER,
     inputs=RegisterScenes,
     outputs={

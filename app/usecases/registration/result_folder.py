@@ -134,13 +134,13 @@ def _refuse_fixed(folder: Path, place: Path) -> None:
     inside = folder / "registered"
     if Path.cwd().is_relative_to(place):
         raise InputError(
-            f"{folder}: is the present folder or holds it, and a result replaces its folder as a whole; "
+            f"{folder}: is the working folder or contains it, and a result replaces its whole folder; "
             f"name a folder inside it: -o {inside}"
         )
     if place.is_mount():
         raise InputError(
-            f"{folder}: is the root of a volume, and a result replaces its folder as a whole; name a "
-            f"folder inside it: -o {inside}"
+            f"{folder}: is the root of a volume, and a result replaces its whole folder; name a folder "
+            f"inside it: -o {inside}"
         )
 
 
@@ -153,7 +153,7 @@ def _locked(folder: Path, work: Path) -> int:
     for _ in range(_MOST_LOCKS):
         work.mkdir(parents=True, exist_ok=True)
         if not (work / _LOCK).exists() and any(work.iterdir()):
-            raise InputError(f"{work}: holds files that Amers did not write; move this folder away")
+            raise InputError(f"{work}: contains files that Amers did not write; move this folder away")
         try:
             lock = os.open(work / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
         except FileNotFoundError:
@@ -217,15 +217,15 @@ def _replaceable(folder: Path) -> OlderResult | None:
     manifest = _read_manifest(folder)
     if manifest is None:
         raise InputError(
-            f"{folder}: holds files, and no {MANIFEST} proves that they are a result of Amers; name an "
-            "empty or new folder with -o"
+            f"{folder}: contains files, but no {MANIFEST} that identifies them as a result of Amers; "
+            "name an empty or new folder with -o"
         )
     files = manifest["files"]
     foreign = sorted(set(found) - set(files) - {MANIFEST})
     if foreign:
         raise InputError(
-            f"{folder}: holds {_listed(foreign)} beside the result, which would be lost; move them "
-            "away, or name another folder with -o"
+            f"{folder}: contains {_listed(foreign)} in addition to the result; these files would be "
+            "lost: move them away, or name another folder with -o"
         )
     changed = [name for name in files if name in found and not _is_as_written(found[name], files[name])]
     if changed:

@@ -103,7 +103,7 @@ def parse_csv(
 
     Raises:
         FormatError: a column is missing, or a line has another form.
-        InputError: nobody states the reference system of x and y, or both do.
+        InputError: neither file nor caller state the reference system of x and y, or both do.
         VerticalDatumError: the caller does not state the datum of the heights.
     """
     statements, names = _first_lines(text)

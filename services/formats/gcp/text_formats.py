@@ -103,7 +103,7 @@ def parse_asp_gcp(
         heights: datum of the heights, which the file never states.
         source: its name, for messages.
         sigmas: axes of the sigmas, where the file does not state them: "ecef" or "lat-lon-height"; when
-            nobody states them, sigmas that differ are unknown.
+            they are not stated, sigmas that differ are unknown.
 
     Raises:
         FormatError: a line has another form.

@@ -130,7 +130,7 @@ class RasterImage:
 
         None for floating-point pixels and for 8 bits: producers stretch the contrast of 8-bit images for
         display, so that their largest value is valid. 12 bits in 16, when neither file nor product says
-        so, have a largest value that nobody states, and it counts as grey.
+        so, do not state their largest value, and it counts as grey.
         """
         dtype = np.dtype(self.dataset.dtypes[band - 1])
         if dtype.kind not in "ui" or dtype.itemsize < 2:

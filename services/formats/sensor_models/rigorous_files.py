@@ -44,7 +44,7 @@ def rigorous_model_of_image(
 
     Raises:
         FormatError: a value of the model is missing or impossible, or the image is a part of the one it
-            is for and nobody states which.
+            is for and it is not stated which.
     """
     for path in _metadata_of(image, model_path):
         text = read_text(path)

@@ -92,7 +92,7 @@ def test_heights_whose_common_error_nobody_states_are_refused() -> None:
     unknown = replace(
         one.heights, frames=tuple(Frame.from_sigmas(np.nan, np.nan) for _ in one.heights.frames)
     )
-    with pytest.raises(InputError, match=r"nobody states how far.*control-dem-frame-sigma-m"):
+    with pytest.raises(InputError, match=r"common error is not stated.*control-dem-frame-sigma-m"):
         adjust_block(one.images, one.observations, control=unknown)
 
 

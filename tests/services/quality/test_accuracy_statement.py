@@ -67,14 +67,14 @@ def test_the_words_say_what_is_unknown_and_why():
     nothing = scene_accuracy(0.11, np.nan, UNKNOWN_FRAME).lines[1]
     assert nothing == (
         "On the Earth: CE90 unknown (worst place of the image), LE90 of the control points' frame "
-        "unknown: nobody stated the frame of the control points"
+        "unknown: the accuracy of the control points' frame is not stated"
     )
     no_height = scene_accuracy(0.11, np.nan, Frame.from_sigmas(1.5, np.nan)).lines[1]
-    assert no_height.endswith("unknown: nobody stated the height of the control points' frame")
+    assert no_height.endswith("unknown: the height accuracy of the control points' frame is not stated")
     block = points_accuracy(MEDIAN_M2, Frame.from_sigmas(1.5, np.nan), "median of the points")
     assert block.lines[1] == (
-        "On the Earth: CE90 3.25 m, LE90 unknown (median of the points): nobody stated the height of "
-        "the control points' frame"
+        "On the Earth: CE90 3.25 m, LE90 unknown (median of the points): the height accuracy of the "
+        "control points' frame is not stated"
     )
     assert np.isnan(block.on_the_earth.le90_m)
 
@@ -97,10 +97,13 @@ def test_vertices_of_a_scene_that_is_not_registered_have_the_accuracy_of_its_mod
         "On the Earth": "CE90 30.00 m (worst vertex), 25.00 m (median vertex)",
     }
     assert (
-        "nobody stated the accuracy of its model" in vertices_accuracy(unknown, unknown, None).lines[1]
+        "the accuracy of its model is not stated" in vertices_accuracy(unknown, unknown, None).lines[1]
     )
     in_no_frame = vertices_accuracy(np.array([1.0]), unknown[:1], UNKNOWN_FRAME).lines[1]
-    assert in_no_frame == "On the Earth: CE90 unknown: nobody stated the frame of the control points"
+    assert (
+        in_no_frame
+        == "On the Earth: CE90 unknown: the accuracy of the control points' frame is not stated"
+    )
 
 
 def test_the_median_point_of_a_block_is_stated_without_and_with_its_frame() -> None:
@@ -117,6 +120,6 @@ def test_a_figure_that_is_unknown_is_null_in_a_document() -> None:
     assert document["relative_to_control_points"]["ce90_m"] == 1.0
     assert document["on_the_earth"]["ce90_m"] is None
     assert document["on_the_earth"]["le90_m"] is None
-    assert "nobody stated the frame" in str(document["on_the_earth"]["words"])
+    assert "frame is not stated" in str(document["on_the_earth"]["words"])
     failed = accuracy_document(no_accuracy("no point was found"))
     assert {one["words"] for one in failed.values()} == {"none: no point was found"}

@@ -65,8 +65,8 @@ def test_what_chance_explains_is_not_named_however_large(family: Family) -> None
     [
         ("lines", "attitude jitter"),
         ("samples", "seams between detectors"),
-        ("height", "model is that of another view"),
-        ("chips", "too fast for positions of whole chips"),
+        ("height", "model belongs to another view"),
+        ("chips", "attitude jitter that is shorter than a chip"),
     ],
 )
 def test_a_structure_says_what_it_looks_like(family: Family, words: str) -> None:
@@ -76,8 +76,8 @@ def test_a_structure_says_what_it_looks_like(family: Family, words: str) -> None
 @pytest.mark.parametrize(
     ("family", "words"),
     [
-        ("steps", "at line 800: lines that were lost"),
-        ("seams", "at sample 800: a seam between detectors"),
+        ("steps", "at line 800. Possible cause: lines that were lost"),
+        ("seams", "at sample 800. Possible cause: a seam between detectors"),
     ],
 )
 def test_a_step_says_where_it_is_and_what_it_looks_like(family: Family, words: str) -> None:

@@ -60,7 +60,7 @@ def test_the_model_of_another_view_is_told_by_its_angle(by_deg: float, towards_d
         assert not criterion.met
         assert criterion.needed_for == "usable"
         assert f"seen {sight.angle_deg:.0f} degrees" in criterion.note
-        assert "the model is that of another view" in criterion.note
+        assert "the model of the scene belongs to another view" in criterion.note
 
 
 @pytest.mark.monte_carlo

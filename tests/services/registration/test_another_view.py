@@ -34,7 +34,7 @@ def refused(displacement_px: Array, height_m: Array) -> str:
 def test_a_search_that_begins_with_the_finest_chips_names_the_model_of_another_view() -> None:
     height_m = np.random.default_rng(5).uniform(0.0, 100.0, 64)
     said = refused(height_m[:, None] * [0.0, 0.3], height_m)
-    assert "the model is that of another view" in said
+    assert "The model belongs to another view" in said
 
 
 @pytest.mark.parametrize("seed", range(4))
