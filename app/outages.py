@@ -1,4 +1,4 @@
-"""Outages: what of the infrastructure has failed, from the error that tells it.
+"""Outages: the part of the infrastructure that has failed, from the error of the database or the disk.
 
 An outage is nobody's input and no bug: a database that is read-only, full, starting or gone. One table
 says for each kind what a reply, a command and the log state, with which status, and whether the same may

@@ -1,6 +1,6 @@
 """Bodies of requests: bounds on their size and their time, and reading them chunk by chunk.
 
-A body is read under the bounds of a caller nobody knows yet, `ANONYMOUS_BODY_BYTES`. A route that has
+A body is read under the bounds of an unknown caller, `ANONYMOUS_BODY_BYTES`. A route that has
 authenticated its caller raises the limit (`amers.app.api.routes`); only a route that takes uploads
 raises it to that of uploads. So a route without a word about its body has the small limit, whatever its
 path.

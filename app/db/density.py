@@ -57,7 +57,7 @@ def count_unserved_cells(connection: Connection) -> None:
 
 
 def points_in_box(connection: Connection, box: Box) -> int:
-    """About how many points a box contains: those of cells inside, and of others in proportion to area.
+    """Estimated number of points in a box: cells inside count fully, others in proportion to area.
 
     The error is at most the number of points of the cells that the edge of the box cuts.
     """

@@ -1,4 +1,4 @@
-"""Figures of the installation that are worth watching: what is published, what waits, what it takes."""
+"""Figures of the installation for monitoring: published blocks, waiting jobs, used storage."""
 
 from dataclasses import dataclass
 

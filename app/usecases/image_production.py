@@ -62,8 +62,8 @@ class WorkPlace:
     """Where the work is done.
 
     Attributes:
-        folder: of the results of all tasks, so that an interrupted production goes on; by default beside
-            the block, until the block is complete.
+        folder: of the results of all tasks, so that an interrupted production continues; by default next
+            to the block, until the block is complete.
         compute: processes or a cluster.
     """
 

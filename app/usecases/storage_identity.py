@@ -64,7 +64,7 @@ def require_match(database: Database, storage: Storage) -> None:
 
 
 def expect(connection: Connection, storage: Storage) -> InstallationRow:
-    """Tell a storage the installation whose marker each write needs; returns its identity."""
+    """Bind a storage to its installation, which each write checks; returns its identity."""
     row = installation.read(connection)
     if storage.proof is not None:
         storage.proof.bind(row.id)

@@ -1,4 +1,4 @@
-"""Who keeps how much: the ledger of the storage by owner, and the files that belong to nobody."""
+"""Used storage by owner, and the files without an owner."""
 
 from dataclasses import dataclass
 from uuid import UUID

@@ -59,8 +59,8 @@ def block_gauge(
     """The effect of translations and linear deformations of each group on its parameters.
 
     Tie points do not determine the position of a block. Its images see it under slightly different
-    angles from edge to edge, though, and a distortion of 0.1 px would pass for a translation by metres:
-    what observations seem to tell of a translation is not used. The same holds for a ground that is
+    angles from edge to edge, though, and a distortion of 0.1 px would look like a translation by metres.
+    So the observations are not used to estimate a translation. The same holds for a ground that is
     sheared, stretched or tilted as a whole, where the images may drift and skew: all of them would
     together, and only relief, seen under different angles, shows it.
 

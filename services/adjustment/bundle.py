@@ -105,8 +105,8 @@ def adjust_block(
         images: with what may move.
         observations: m image positions of points, by point.
         control: known ground positions of some of the points.
-        neighbour: images of an adjusted block, some of which are images of this one: what it tells of
-            their parameters is observed, and what they observe of their common points is not used again.
+        neighbour: images of an adjusted block, some of them also images of this one. Their adjusted
+            parameters are observations here; their own observations of common points are not used again.
         passes: masks (n,) of images that may share errors, such as those of one pass; it is unknown how
             much, and the frames cover every share.
         options: thresholds.

@@ -46,7 +46,7 @@ class KnownImages:
         return len(self.names)
 
     def take(self, rows: IntArray) -> "KnownImages":
-        """Some of the images, with as many parameters as that of them has that has most."""
+        """A part of the images, with as many parameters as the one that has most."""
         parameters = tuple(self.parameters[row] for row in rows.tolist())
         most = max(map(len, parameters), default=0)
         inside = (rows[:, None] * self.values.shape[1] + np.arange(most)).ravel()

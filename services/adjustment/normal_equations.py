@@ -74,7 +74,7 @@ def _add(normal: Array, right: Array, derivative: Array, residual: Array, weight
 
 
 class RobustTerms(NamedTuple):
-    """How points are intersected robustly, and what holds the heights of those whose rays tell none.
+    """How points are intersected robustly, and the prior of heights that rays do not determine.
 
     Attributes:
         scale: of the Cauchy weights, in sigmas of the observations.

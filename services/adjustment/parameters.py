@@ -16,7 +16,8 @@ from amers.services.types import Array, BoolArray, IntArray
 
 PASS_SHARE = 0.5
 """Share of the variance of the shifts that the images of a pass have in common, as the adjustment
-weights them. Nobody states it: the frame of the block covers every share between none and all."""
+weights them. The true share is unknown: the frame of the block covers every share between none and
+all."""
 
 
 _NAMES = (
@@ -267,7 +268,7 @@ class BlockPriors:
         size: parameters of the image that has most; those that others lack have no derivative.
         locating: (K, K) sparse, inverse covariance of the parameters that tell where images lie.
         shape: (K,) inverse variances of the others: drifts and skews.
-        estimated: (K,) those of them whose size the block tells.
+        estimated: (K,) parameters that the block determines.
         mean: (K,) what is expected: 0, or what a neighbouring block tells.
     """
 

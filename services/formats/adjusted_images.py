@@ -1,4 +1,4 @@
-"""The adjusted images of a block in a file, for blocks that are made beside it later."""
+"""The adjusted images of a block in a file, for neighbouring blocks that are made later."""
 
 import zipfile
 from dataclasses import fields

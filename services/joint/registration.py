@@ -143,7 +143,7 @@ def register_together(
 
 
 def _on_known_ground(scene: Scene, points: ControlPoints) -> Scene:
-    """The scene, whose rigorous model holds for all ground on the Earth, kept to that of the points.
+    """The scene with its rigorous model limited to the ground of the points.
 
     Rays are searched for along these heights, and other models do not hold beyond theirs.
     """

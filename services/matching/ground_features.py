@@ -56,7 +56,7 @@ class Features:
         return len(self.line_sample)
 
     def directions(self) -> FloatImage:
-        """Descriptors (n, 128) of unit length, whose scalar product tells how alike they are.
+        """Descriptors (n, 128) of unit length; their scalar product is their similarity.
 
         The distance of the square roots is the Hellinger distance of the histograms. Source:
         Arandjelovic and Zisserman (2012), Three things everyone should know to improve object retrieval.

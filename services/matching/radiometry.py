@@ -10,7 +10,7 @@ from amers.services.imagery.gaps import LOST_SHARE
 from amers.services.types import Array, BoolArray, FloatImage
 
 MIN_FOUND = 5
-"""Fewest points found whose surroundings serve as the reference for those of the others."""
+"""Fewest found points: their surroundings are the reference for the surroundings of all others."""
 
 CLOUD_ROUGHNESS = 0.4
 """Largest roughness of a cloud, as a fraction of the median roughness around the points found."""

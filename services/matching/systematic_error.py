@@ -90,9 +90,9 @@ def _image_variance_px2(views: Views, row: IntArray, offset: Array, weight: Arra
     squares, less what the scatter of the views brings by chance, estimate their variance; the mean of
     all measures has that variance times the sum of `s^2`. An image that looks unlike the scene is
     further off and has a small share: images count in the estimate by their shares.
-    Few images show little of it: a prior adds the offset expected without any, and the factor of
-    Student's distribution makes the 90 % region hold what it says. The prior counts less the further
-    what is seen exceeds it, down to one difference of images with it.
+    Few images determine it badly: a prior adds the offset expected without images, and the factor of
+    Student's distribution makes the 90 % region contain 90 %. The prior counts less the further what is
+    seen exceeds it, down to one difference of images with it.
     """
     point = np.searchsorted(views.start, row, side="right")
     _, point = np.unique(point, return_inverse=True)

@@ -40,7 +40,8 @@ def bends(residuals: Residuals, expected: Array, shape: tuple[int, int]) -> tupl
     """The bends along lines and along samples that the points leave open; none where that is little.
 
     Args:
-        residuals: of the active measures, whose covariance holds all their errors and what is followed.
+        residuals: of the active measures, with a covariance that includes all their errors and the
+            followed components.
         expected: (2, k) a priori weights of the parameters.
         shape: lines and samples of the image.
     """

@@ -3,11 +3,11 @@
 The displacement of each coordinate is a sum of Gaussian processes, the components. Those of images that
 were scanned depend on the line or the sample: smooth ones (bow, slow attitude, distortion of the
 optics), narrow bands (jitter) and steps (lost or repeated lines, seams between detectors). Those of
-ortho-images depend on both, and are smooth (terrain, seams of a mosaic). A component is added as long as
-the residuals show one that chance does not explain and that predicts blocks of lines or samples which
-were held out. Kernels and variances are those of the largest restricted likelihood (Patterson and
-Thompson, 1971); estimate and covariance are those of universal kriging. Where the pixels show a break,
-there is a step of any size.
+ortho-images depend on both, and are smooth (terrain, seams of a mosaic). Components are added while the
+residuals show one that chance does not explain and that predicts held-out blocks of lines or samples.
+Kernels and variances are those of the largest restricted likelihood (Patterson and Thompson, 1971);
+estimate and covariance are those of universal kriging. Where the pixels show a break, there is a step of
+any size.
 """
 
 from collections.abc import Mapping, Sequence
@@ -75,7 +75,7 @@ Along the samples, what is shorter than optics do is a seam between detectors.""
 _COHERENCE = (0.15, 0.4, 2.0)
 """Lengths over which a narrow band keeps its phase, the same."""
 _FEWEST_OF_SWATH = 24
-"""Fewest measures by which turns of lines are followed: what is wrong with fewer, some turn explains."""
+"""Fewest measures by which turns of lines are followed: with fewer, a turn explains any error."""
 _LEAST_SEEN = 0.4
 """Share of its amplitude that chips show of a jitter that can be followed."""
 _FINE = 8
@@ -259,7 +259,7 @@ def _again(residuals: Residuals, components: list[Component]) -> list[Component]
 
 
 def with_components(residuals: Residuals, components: Sequence[Component]) -> Residuals:
-    """The same residuals, of which the covariance holds what the components displace."""
+    """The same residuals, with the covariance of the components added to theirs."""
     place = residuals.line_sample
     covariance = residuals.covariance.copy()
     for component in components:
@@ -268,7 +268,7 @@ def with_components(residuals: Residuals, components: Sequence[Component]) -> Re
 
 
 def beyond(residuals: Residuals, components: Sequence[Component]) -> Residuals:
-    """The residuals for tests of what the components leave: what they can follow counts as followed."""
+    """The residuals without everything that the components can follow, for tests."""
     loose = [component.scaled(_LOOSE) for component in components if component.kind != "break"]
     return with_components(beside_breaks(residuals, components), loose)
 

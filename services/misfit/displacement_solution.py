@@ -107,7 +107,7 @@ def solve_displacement(
     """Estimate and covariance of parameters and displacement.
 
     Args:
-        residuals: of the active measures, whose covariance holds all their errors.
+        residuals: of the active measures, with a covariance that includes all their errors.
         components: of the displacement.
         expected: (2, k) a priori weights of the parameters.
         shape: lines and samples of the image, which the nodes cover.

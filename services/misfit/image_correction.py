@@ -407,7 +407,7 @@ def _short_motion(
 
 
 def _in_held_parts(observations: ControlObservations, active: BoolArray) -> BoolArray:
-    """Measures (n,) in parts of a broken image whose place more than two active ones tell."""
+    """Measures (n,) in parts of a broken image with more than two active measures."""
     if observations.breaks is None:
         return np.ones_like(active)
     line = np.nan_to_num(observations.line_sample[:, 0])

@@ -1,4 +1,4 @@
-"""Ground that moved, told from all else that displaces the points of an area.
+"""Ground that moved, separated from all other causes that displace the points of an area.
 
 A landslide, a quarry or a part of another image displaces an area by one vector. Where it moved by a few
 times what points scatter, its points are no outliers, and motion along lines and samples comes near to
@@ -268,10 +268,10 @@ _ELLIPSES = np.concatenate(
 def _log_likelihood(residuals: Residuals, agrees: BoolArray) -> float:
     """Logarithm of how likely measures are, but for a constant.
 
-    Those that do not agree count as far as the others predict them, up to a limit.
+    Points that do not agree count by their distance from the prediction of the others, up to a limit.
 
     Args:
-        residuals: of all measures, whose covariance holds all that moves them.
+        residuals: of all measures, with a covariance that includes everything that displaces them.
         agrees: (n,) those that determine the solution.
     """
     total, square = 0.0, np.zeros(int((~agrees).sum()))

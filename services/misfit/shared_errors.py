@@ -41,7 +41,7 @@ _CLIPPED_VARIANCE = float(
 )
 """Variance of a normal law of unit variance when values beyond the clip are set to it."""
 _ENOUGH = 250
-"""Measures that tell share and length; more cost more and tell no more."""
+"""Number of measures from which share and length are estimated; more are slower and no more precise."""
 _UNKNOWN_OFFSET_PX = 1.0
 """A priori standard deviation of the offset of a block whose frame is not stated."""
 

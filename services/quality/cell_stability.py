@@ -27,8 +27,8 @@ class CellStability:
     """The adjustment repeated without the points of one cell at a time, which have no neighbours left.
 
     An error that neighbours share moves a point held out at random together with those around it, and so
-    stays hidden. It shows where all points of a cell are held out, as far as it does not reach further
-    than a cell; one that reaches over the whole image shows in neither.
+    stays hidden. It appears when all points of a cell are held out, if it does not reach farther than a
+    cell; an error that reaches over the whole image appears in neither.
 
     Attributes:
         cells: along each side of the area of the active points.

@@ -185,8 +185,8 @@ def missed_criterion(
         size: lines or samples of the image.
         misfit_px: (n, 2) from where the scene places the points to where they were found; without, the
             borders are not looked at by themselves.
-        counts: (n,) points that count beside the active ones: neither cut by a break of the image nor
-            where the scene says, as far as its accuracy goes; all when None.
+        counts: (n,) points that count in addition to the active ones: not cut by a break of the image,
+            and farther from their place in the scene than its accuracy; all when None.
     """
     name = f"missed_along_{along}"
     disagree = (*UNFOUND, "deactivated") if along == "lines" else ("deactivated",)

@@ -1,8 +1,9 @@
-"""The line of sight of a scene that its chips imply, beside that of its model.
+"""The line of sight of a scene that its chips imply, compared with that of its model.
 
-A slope shears the chips of a point, and each by how differently its view and the scene see the ground:
-the slope and the direction of the scene follow from several of them, whatever the model says. Residuals
-against height need heights that differ by more than their errors; slopes are seen on level ground.
+A slope shears each chip of a point by the difference between the directions of its view and of the
+scene. The slope and the direction of the scene follow from several chips, without the model of the
+scene. Residuals against height need heights that differ by more than their errors; slopes are seen on
+level ground.
 """
 
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Lines or samples of an image whose points do not agree with the rest, where those of others do.
+"""Lines or samples of an image in which almost no point fits, while the rest fits.
 
 A scanner takes all samples of a line at once: where it jumped, or swung by more than a search reaches,
 whole lines are lost to the adjustment. A detector takes the same samples of all lines: where it is out
@@ -55,11 +55,11 @@ def missed_at_borders(
 ) -> BoolArray:
     """Points (n,) between a border and the first that agrees, where chance leaves out fewer.
 
-    The last part of an image that was put together, or that swings, has no points on its other side:
-    what is left out there is no gap, and the correction goes on beyond the others as if it held. The
+    The last part of an image that was put together, or that oscillates, has no points on its other side.
+    Points that are left out there form no gap, and the correction is extrapolated beyond the others. The
     chance that the points of a border are all among those left out is that of drawing them without
-    return, times the four borders of an image, at most 0.01. They are displaced alike: false matches
-    are not.
+    return, times the four borders of an image, at most 0.01. They are displaced alike: false matches are
+    not.
 
     Args:
         position: (n,) line or sample where the points are expected.

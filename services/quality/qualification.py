@@ -33,7 +33,7 @@ from amers.services.quality.stability import (
 from amers.services.types import Array, BoolArray, Frame, Measures
 
 _ENOUGH_RESIDUALS = 6
-"""Active points whose residuals tell a standard deviation."""
+"""Fewest active points for a standard deviation of their residuals."""
 _MOST_WORSE = 4.0
 """Errors of points are believed up to this many times their stated accuracy."""
 _CLEARLY_WORSE = 1.3

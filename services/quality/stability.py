@@ -127,8 +127,8 @@ class Stability:
         failed_draws: number of adjustments that gave no solution.
         held_out_per_draw: number of points held out of each draw.
         displacements: of the four corners and the centre; empty when no draw succeeded.
-        held_out_px: residuals of the points held out, all draws together; a point counts once in each
-            draw that it was held out of.
+        held_out_px: residuals of the points held out, all draws together; a point counts once for each
+            draw without it.
         held_out_m: the same on the ground, by the ground sampling of the image.
         group_means: mean residuals of the points held out together.
         note: why there is no figure; "" otherwise.

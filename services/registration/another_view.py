@@ -1,4 +1,4 @@
-"""What the points of a first search that was refused tell of a model that is not the image's."""
+"""Whether a refused first search shows that the model belongs to another view."""
 
 import numpy as np
 

@@ -121,7 +121,7 @@ class _Plan:
 
     @property
     def middle_m(self) -> float:
-        """Side of the middle of the scene that the map holds, metres; NaN when it holds all of it."""
+        """Side of the middle part of the scene that the map shows, metres; NaN for the whole scene."""
         return self.size * self.level_m if self.size < self.whole else math.nan
 
 

@@ -73,8 +73,8 @@ def _stretched(pixels: FloatImage, opaque: BoolArray) -> Array:
 
     A stretch between percentiles gives most greys to clouds. The inverse hyperbolic sine makes room for
     dark values (Lupton, Gunn and Szalay, A modified magnitude system, 1999), the equalisation of parts
-    of the image with limited contrast gives it to what is there (Zuiderveld, Contrast limited adaptive
-    histogram equalization, 1994).
+    of the image with limited contrast uses it for the ground that is there (Zuiderveld, Contrast limited
+    adaptive histogram equalization, 1994).
     """
     low, high = np.percentile(pixels[opaque], [1.0, 99.0]) if opaque.any() else (0.0, 1.0)
     share = (np.clip(pixels, low, high) - low) / max(float(high - low), 1e-6)

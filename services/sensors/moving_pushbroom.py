@@ -75,7 +75,7 @@ def moving_model(model: PushbroomModel, correction: ImageCorrection) -> Pushbroo
     Args:
         model: as delivered.
         correction: of its image, with a displacement along lines, along samples or their sum. The affine
-            part says in which lines, and so when, the sensor moved.
+            part determines the lines, and so the times, at which the sensor moved.
 
     Returns:
         None where the image jumps, or lines turn, so that no such motion of the sensor explains it.

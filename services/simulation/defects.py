@@ -1,4 +1,4 @@
-"""Pixels as archives hold them: quantised, some missing, some brighter than the sensor can tell."""
+"""Pixels as in archives: quantised, some missing, some brighter than the sensor can measure."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Detectors that are not where the sensor model says, and that blur what they see."""
+"""Detectors that lie elsewhere than in the sensor model, and that blur the image."""
 
 from dataclasses import dataclass
 

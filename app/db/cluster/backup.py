@@ -147,7 +147,7 @@ def _of_amers(entries: list[str]) -> list[str]:
 
 
 def _postgis_of(entries: list[str]) -> str | None:
-    """The schema in which the PostGIS of an archive was; None if the archive does not tell."""
+    """The schema in which the PostGIS of an archive was; None if the archive does not state it."""
     return next((found[1] for entry in entries if (found := REFERENCE_SYSTEMS.match(entry))), None)
 
 

@@ -50,7 +50,7 @@ class RasterImage:
         dataset: the dataset that `open_raster` opened, with the metadata of the image.
         pixels: the dataset from which pixels are read: the same one, or a working copy.
         mix: the bands and their weights.
-        codes: what the product says about its pixels, beside what the file says.
+        codes: statements of the product about its pixels, in addition to those of the file.
     """
 
     path: FilePlace

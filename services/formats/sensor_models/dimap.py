@@ -148,7 +148,7 @@ def parse_dimap_acquisition(text: str, image_id: str, source: str = "DIMAP") -> 
 
 
 def parse_dimap_pixel_codes(text: str, source: str = "DIMAP") -> PixelCodes:
-    """What the document of a product says about its pixels; the document of its RPC says nothing.
+    """Statements of the document of a product about its pixels; the document of its RPC has none.
 
     Args:
         text: contents of the file.
