@@ -37,8 +37,10 @@ def write_scene(folder: Path) -> Path:
     return _write(simulate_view(world, _plan(world), rng, ground_error_m=(40.0, -30.0)), folder)
 
 
-def true_model_of_scene() -> SensorModel: """The true model of that image; for a real image it is unknown.""" world, rng = _world(),
-np.random.default_rng(3) return plan_geometry(world, _plan(world), rng, ground_error_m=(40.0, -30.0)).true_model
+def true_model_of_scene() -> SensorModel:
+    """The true model of that image; for a real image it is unknown."""
+    world, rng = _world(), np.random.default_rng(3)
+    return plan_geometry(world, _plan(world), rng, ground_error_m=(40.0, -30.0)).true_model
 
 
 def write_terrain(path: Path) -> Path:
