@@ -40,7 +40,7 @@ class ImagePlan:
         shape, gsd_m: lines and samples, ground sampling.
         sigma_m: one standard deviation of the shift of the delivered model, as stated too.
         slope_px: largest drift and skew of the delivered model.
-        swing_px: (line, sample) amplitude of a sensor that swings: one wave along the lines.
+        wave_px: (line, sample) amplitude of a sensor that oscillates: one wave along the lines.
         bend_px: (line, sample) amplitude of what no correction follows: one wave along the diagonal.
         control_noise_px, tie_noise_px: of the measures, as stated too.
         found: share of the control points in the image that are found.
@@ -56,7 +56,7 @@ class ImagePlan:
     gsd_m: float
     sigma_m: float = 5.0
     slope_px: float = 1.0
-    swing_px: tuple[float, float] = (0.0, 0.0)
+    wave_px: tuple[float, float] = (0.0, 0.0)
     bend_px: tuple[float, float] = (0.0, 0.0)
     control_noise_px: float = 0.3
     tie_noise_px: float = 0.2
@@ -89,11 +89,11 @@ class SceneTruth:
         return self.moved(self.error.apply(self.geometry.rpc.project(lon_lat_h)))
 
     def moved(self, position: Array) -> Array:
-        """Positions (n, 2) of an image that swings and is bent as planned."""
+        """Positions (n, 2) of an image that oscillates and is bent as planned."""
         along_lines = np.sin(2.0 * np.pi * position[:, :1] / self.shape[0])
         diagonal = np.sin(2.0 * np.pi * position.sum(axis=1, keepdims=True) / sum(self.shape))
-        swing_px, bend_px = np.array(self.plan.swing_px), np.array(self.plan.bend_px)
-        return np.asarray(position + along_lines * swing_px + diagonal * bend_px)
+        wave_px, bend_px = np.array(self.plan.wave_px), np.array(self.plan.bend_px)
+        return np.asarray(position + along_lines * wave_px + diagonal * bend_px)
 
     def shows(self, lon_lat_h: Array) -> BoolArray:
         """Which ground points lie inside."""

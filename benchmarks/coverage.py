@@ -7,7 +7,7 @@ share, and a law of the errors is drawn many times:
 
 * layouts: spread over the image, half of it, a line across it, a corner, two clusters;
 * shared: nothing; half to nine tenths of the variance correlated over 0.05 to 0.2 of the image; two
-  blocks that meet in the scene, each with its own offset of 0.8 px on each axis, which nobody stated;
+  blocks that meet in the scene, each with its own offset of 0.8 px on each axis, which is not stated;
 * laws: normal; heavy tails (Student's t of three degrees of freedom, as precise in its centre as stated,
   and 5 % blunders); normal with sigmas stated four times too small.
 

@@ -50,6 +50,8 @@ OLD_WORDS = (
     r"[\"'`]uncertain[\"'`]",
     r"(condition|collection)\.(beside|everything)\b",
     r"record of changes",
+    r"\bsw(ing(s|ing)?|ung)\b",
+    r"\bnobody (states|stated) (it|them|the)\b",
 )
 """Words that the glossary has replaced; see `docs/glossary.md` for those in use."""
 EXAMPLES_OF_NAMES = {"match_count", "reported_sigma_m"}

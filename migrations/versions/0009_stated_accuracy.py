@@ -1,7 +1,7 @@
 """The accuracy that every place states: of blocks in columns, and of the heights of reference images.
 
 CE90 and LE90 of the median point of a block, in the frame of the block and on the Earth; null where
-nobody stated the frame. The blocks present get theirs from their quality and their documents. It locks
+the frame is not stated. The blocks present get theirs from their quality and their documents. It locks
 the tables of blocks and reference images for the time that reading the documents of all blocks takes,
 some milliseconds each; the points are not touched.
 """

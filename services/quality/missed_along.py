@@ -1,8 +1,8 @@
 """Lines or samples of an image in which almost no point fits, while the rest fits.
 
-A scanner takes all samples of a line at once: where it jumped, or swung by more than a search reaches,
-whole lines are lost to the adjustment. A detector takes the same samples of all lines: where it is out
-of place, these are lost. What hides points hides them here and there.
+A scanner takes all samples of a line at once: where it jumped, or oscillated by more than the search
+radius, the adjustment loses whole lines. A detector takes the same samples of all lines: where it is out
+of place, these are lost. Clouds and changes hide single points instead.
 """
 
 import numpy as np

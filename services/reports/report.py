@@ -183,7 +183,7 @@ class RegistrationReport:
             "relative to the control points and on the Earth".
         verdict_explanation: what the verdict means, for people.
         relative_to_control_points: accuracy without the frame of the control points.
-        on_the_earth: accuracy with it, unknown where nobody stated it.
+        on_the_earth: accuracy with it, unknown where it is not stated.
         criteria: every figure that has a limit.
         scene: what was registered.
         correction: of the model of the scene.

@@ -49,17 +49,17 @@ VIEWS = {
     "orbit_a": (14.0, 100.0),
     "orbit_b": (9.0, 270.0),
     "orbit_c": (18.0, 20.0),
-    "swinging": (11.0, 190.0),
+    "oscillating": (11.0, 190.0),
 }
 MICRORADIANS = {
     "orbit_a": (6.0, -5.0),
     "orbit_b": (-7.0, 4.0),
     "orbit_c": (4.0, 6.0),
-    "swinging": (5.0, -4.0),
+    "oscillating": (5.0, -4.0),
 }
 """By how much roll and pitch in the metadata are off: 3 to 5 m on the ground."""
-SWING_PX = 3.0, 4.0
-"""Of lines and samples of the image that swings, half a wave along it."""
+WAVE_PX = 3.0, 4.0
+"""Of lines and samples of the image that oscillates, half a wave along it."""
 A_FIFTH_OF_A_PIXEL = 0.2
 
 
@@ -83,16 +83,16 @@ def true_model(name: str) -> PushbroomModel:
     terms = np.zeros(len(TERMS))
     terms[:2] = np.array(MICRORADIANS[name]) * 1e-6
     model = PushbroomErrors(delivered(name)).corrected(terms).cropped(FIRST, (SIZE, SIZE))
-    if name != "swinging":
+    if name != "oscillating":
         return model
-    moving = moving_model(model, replace(no_correction((SIZE, SIZE)), displacement=swing()))
+    moving = moving_model(model, replace(no_correction((SIZE, SIZE)), displacement=oscillation()))
     assert moving is not None
     return moving
 
 
-def swing() -> DisplacementGrid:
+def oscillation() -> DisplacementGrid:
     lines, samples = np.linspace(0.0, SIZE - 1.0, 101), np.array([0.0, SIZE - 1.0])
-    wave = np.sin(np.pi * lines / SIZE)[:, None, None] * np.array(SWING_PX)
+    wave = np.sin(np.pi * lines / SIZE)[:, None, None] * np.array(WAVE_PX)
     grid = np.repeat(wave, 2, axis=1)
     return DisplacementGrid(lines, samples, grid, np.zeros_like(grid))
 
@@ -190,20 +190,20 @@ def test_rigorous_scenes_and_an_rpc_are_registered_in_one_block(
         assert words in text
 
 
-def test_a_satellite_that_swings_is_told_by_its_attitude(
+def test_a_satellite_that_oscillates_is_told_by_its_attitude(
     world: FlatWorld, folder: Path, tmp_path: Path
 ) -> None:
-    """Its points lie on the middle half of the lines: beyond them nobody knows how it swings."""
-    images = [folder / "IMG_swinging.tif", folder / "IMG_orbit_a.tif", folder / "rpc.tif"]
+    """Its points lie on the middle half of the lines: beyond them nobody knows how it oscillates."""
+    images = [folder / "IMG_oscillating.tif", folder / "IMG_orbit_a.tif", folder / "rpc.tif"]
     done = register(world, tmp_path / "out", *images, "--rigorous", "srp")
     assert done.returncode == 3, done.stderr
-    assert "IMG_swinging.tif: the registration has the verdict failed (Predicted CE90" in done.stderr
-    own, block = (tmp_path / "out" / name for name in ("IMG_swinging", "block"))
+    assert "IMG_oscillating.tif: the registration has the verdict failed (Predicted CE90" in done.stderr
+    own, block = (tmp_path / "out" / name for name in ("IMG_oscillating", "block"))
     correction = parse_correction((own / "correction.json").read_text())
-    model = CorrectedModel(delivered("swinging").cropped(FIRST, (SIZE, SIZE)), correction)
+    model = CorrectedModel(delivered("oscillating").cropped(FIRST, (SIZE, SIZE)), correction)
     lines, samples = np.meshgrid(np.linspace(230.0, 570.0, 9), np.linspace(50.0, SIZE - 51.0, 9))
     at = np.column_stack([lines.ravel(), samples.ravel()])
-    shown = model.project(true_model("swinging").locate(at, np.full(len(at), GROUND_H)))
+    shown = model.project(true_model("oscillating").locate(at, np.full(len(at), GROUND_H)))
     assert np.linalg.norm(shown - at, axis=1).max() < 3.0 * A_FIFTH_OF_A_PIXEL
     turns = np.loadtxt(own / "attitude.csv", delimiter=",", skiprows=1)
     assert (np.diff(turns[:, :2], axis=0) > 0.0).all()

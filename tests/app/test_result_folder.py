@@ -162,7 +162,7 @@ def lose_the_manifest(folder: Path) -> None:
         (put_a_folder, "other-scene"),
         (edit_a_file, "refined_RPC.TXT changed"),
         (replace_a_file_by_a_link, "report.txt changed"),
-        (lose_the_manifest, "no manifest.json proves"),
+        (lose_the_manifest, "no manifest.json that identifies"),
     ],
 )
 def test_files_that_amers_did_not_write_are_neither_deleted_nor_overwritten(

@@ -108,7 +108,7 @@ def test_owslib_registers_a_scene(http: httpx.Client, job: dict[str, Any]):
     files = {name for name, value in results.items() if isinstance(value, dict) and "href" in value}
     assert files == {*OUTPUTS, "scene0_RPC.TXT"}
     assert results["relative_to_control_points"]["ce90_m"] > 0
-    assert results["on_the_earth"]["ce90_m"] is None, "nobody stated the frame of the block"
+    assert results["on_the_earth"]["ce90_m"] is None, "the frame of the block is not stated"
 
 
 def test_owslib_gets_a_report_by_value_and_a_model_by_reference(

@@ -232,10 +232,10 @@ def test_a_neighbour_and_control_place_a_block_together() -> None:
 def test_an_image_whose_lines_one_block_followed_and_the_other_did_not_ties_nothing() -> None:
     """Its parameters are those of the rest, and mean something else without what was followed."""
     ends = np.array([0.0, 1000.0])
-    swing = DisplacementGrid(ends, ends, np.ones((2, 2, 2)), np.zeros((2, 2, 2)))
+    oscillation = DisplacementGrid(ends, ends, np.ones((2, 2, 2)), np.zeros((2, 2, 2)))
     still, followed = (
         image_parameters("a", FlatModel(), SHAPE, shift_px=5.0, slope_px=1.0, displacement=one)
-        for one in (None, swing)
+        for one in (None, oscillation)
     )
     for before, now in ((still, still), (followed, followed), (still, followed), (followed, still)):
         known = known_images([before], np.zeros((1, 6)), np.eye(6), Frame(np.eye(3)))

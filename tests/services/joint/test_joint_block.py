@@ -142,14 +142,16 @@ def test_a_single_scene_is_adjusted_as_it_is_alone() -> None:
 
 @pytest.mark.thorough
 @pytest.mark.monte_carlo
-@pytest.mark.parametrize("swing_px", [(5.0, 3.0), (0.0, 6.0)])
-def test_a_scene_that_swings_is_followed_with_the_stated_accuracy(swing_px: tuple[float, float]) -> None:
+@pytest.mark.parametrize("wave_px", [(5.0, 3.0), (0.0, 6.0)])
+def test_a_scene_that_oscillates_is_followed_with_the_stated_accuracy(
+    wave_px: tuple[float, float],
+) -> None:
     squares, errors = [], []
     side = np.linspace(0.03, 0.97, 9) * SHAPE[0]
     at = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
     for trial in range(TRIALS):
         rng = np.random.default_rng([5, trial])
-        truth = truth_of(rng, swing_px=swing_px)
+        truth = truth_of(rng, wave_px=wave_px)
         scenes, ties = observed(truth, rng)
         block, left = adjust_fitting(scenes, ties, OPTIONS)
         assert not left
@@ -160,7 +162,7 @@ def test_a_scene_that_swings_is_followed_with_the_stated_accuracy(swing_px: tupl
         errors.append(float(np.quantile(np.hypot(*error.T), 0.9)))
         assert max(normalised(truth, block, number)[0] for number in range(2)) < 4.0
     assert 0.5 < np.mean(squares) < 1.7
-    assert np.median(errors) < 0.35 * np.hypot(*swing_px)
+    assert np.median(errors) < 0.35 * np.hypot(*wave_px)
 
 
 @pytest.mark.parametrize("bend_px", [(8.0, 0.0), (6.0, 6.0)])
@@ -246,11 +248,11 @@ def test_a_scene_that_joins_agrees_with_one_adjustment_of_all_scenes() -> None:
 
 
 @pytest.mark.thorough
-def test_a_scene_that_joins_a_swinging_one_is_tied_to_what_that_scene_truly_shows() -> None:
+def test_a_scene_that_joins_an_oscillating_one_is_tied_to_what_that_scene_truly_shows() -> None:
     squares = []
     for trial in range(3):
         rng = np.random.default_rng([12, trial])
-        truth = truth_of(rng, swing_px=(8.0, 5.0))
+        truth = truth_of(rng, wave_px=(8.0, 5.0))
         scenes, ties = observed(truth, rng)
         redone, _ = adjust_fitting(scenes, ties, OPTIONS)
         first, _ = adjust_fitting(scenes[1:], ties_between(ties, [1, 2]), OPTIONS)

@@ -12,7 +12,7 @@ from amers.services.types import Array
 from tests.services.joint.test_joint_block import SHAPE, observed, truth_of
 
 PERIOD_PX = 300.0
-SWING_PX = np.array([6.0, -4.0])
+WAVE_PX = np.array([6.0, -4.0])
 CHIP_PX = 100.0
 
 
@@ -22,7 +22,7 @@ def still() -> MeasuredScene:
     return observed(truth_of(rng), rng)[0][0]
 
 
-def swinging(displacement_px: Array, line: Array, variance_px2: float = 0.0) -> MeasuredScene:
+def oscillating(displacement_px: Array, line: Array, variance_px2: float = 0.0) -> MeasuredScene:
     """The scene with chips of 100 px, and lines that are displaced (k, 2) as its points show."""
     measured, samples = still(), np.array([0.0, SHAPE[1] - 1.0])
     assert measured.alone is not None
@@ -36,13 +36,13 @@ def swinging(displacement_px: Array, line: Array, variance_px2: float = 0.0) -> 
 def test_a_point_lies_where_its_line_was_and_not_where_its_chip_was_on_average() -> None:
     """Over a chip, a wave is smaller by the sine cardinal of its share of the period."""
     line = np.arange(0.0, SHAPE[0], 3.0)
-    wave = np.sin(2.0 * np.pi * line / PERIOD_PX)[:, None] * SWING_PX
-    measured = swinging(wave, line)
+    wave = np.sin(2.0 * np.pi * line / PERIOD_PX)[:, None] * WAVE_PX
+    measured = oscillating(wave, line)
     seen = measured.observations()
     place = measured.scene.model.project(seen.lon_lat_h)
     inside = (place[:, 0] > CHIP_PX) & (place[:, 0] < SHAPE[0] - CHIP_PX) & measured.usable
     taken_back = (measured.line_sample() - seen.line_sample)[inside]
-    of_line = np.sin(2.0 * np.pi * place[inside, :1] / PERIOD_PX) * SWING_PX
+    of_line = np.sin(2.0 * np.pi * place[inside, :1] / PERIOD_PX) * WAVE_PX
     lost = 1.0 - np.sinc(CHIP_PX / PERIOD_PX)
     assert inside.sum() > 20
     np.testing.assert_allclose(taken_back, lost * of_line, atol=0.1)

@@ -271,9 +271,9 @@ def test_every_scene_of_a_mixed_block_is_qualified_and_has_an_rpc() -> None:
 
 
 @pytest.mark.monte_carlo
-@pytest.mark.parametrize("swing_px", [(5.0, 3.0), (0.0, 6.0)])
-def test_a_rigorous_scene_that_swings_is_followed_with_the_stated_accuracy(
-    swing_px: tuple[float, float],
+@pytest.mark.parametrize("wave_px", [(5.0, 3.0), (0.0, 6.0)])
+def test_a_rigorous_scene_that_oscillates_is_followed_with_the_stated_accuracy(
+    wave_px: tuple[float, float],
 ) -> None:
     """The motion is in the attitude of its model, and in the correction that is nearest to it."""
     squares, errors, attitudes = [], [], []
@@ -282,8 +282,8 @@ def test_a_rigorous_scene_that_swings_is_followed_with_the_stated_accuracy(
     for trial in range(TRIALS):
         rng = np.random.default_rng([37, trial])
         truth = mixed(rng)
-        swings = rigorous_truth(plan_of(0, swing_px=swing_px), SRP, rng)
-        truth = replace(truth, images=(swings, *truth.images[1:]))
+        oscillating = rigorous_truth(plan_of(0, wave_px=wave_px), SRP, rng)
+        truth = replace(truth, images=(oscillating, *truth.images[1:]))
         block, left = adjust_fitting(*observed(truth, rng), OPTIONS)
         assert not left
         model = block.model(0)
@@ -296,11 +296,11 @@ def test_a_rigorous_scene_that_swings_is_followed_with_the_stated_accuracy(
         nearest = nearest_correction(block, 0)
         assert nearest.correction.displacement is not None
         assert nearest.max_error_px < 0.3
-        attitudes.append(len(model.attitude.breaks) > len(swings.delivered.model.attitude.breaks))
+        attitudes.append(len(model.attitude.breaks) > len(oscillating.delivered.model.attitude.breaks))
         assert max(normalised(truth, block, number) for number in range(1, 4)) < 4.0
     assert all(attitudes)
     assert 0.5 < np.mean(squares) < 1.7
-    assert np.median(errors) < 0.35 * np.hypot(*swing_px)
+    assert np.median(errors) < 0.35 * np.hypot(*wave_px)
 
 
 @pytest.mark.long
@@ -308,8 +308,8 @@ def test_a_scene_joins_no_block_in_which_a_satellite_turns() -> None:
     """The motion is not kept with the block: all scenes have to be registered together."""
     rng = np.random.default_rng(39)
     truth = mixed(rng)
-    swings = rigorous_truth(plan_of(0, swing_px=(5.0, 3.0)), SRP, rng)
-    truth = replace(truth, images=(swings, *truth.images[1:]))
+    oscillating = rigorous_truth(plan_of(0, wave_px=(5.0, 3.0)), SRP, rng)
+    truth = replace(truth, images=(oscillating, *truth.images[1:]))
     scenes, ties = observed(truth, rng)
     first, _ = adjust_fitting(scenes[:2], ties_between(ties, [0, 1]), OPTIONS)
     none = np.zeros(0, np.int64)

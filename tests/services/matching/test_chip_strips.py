@@ -33,7 +33,7 @@ def seen(ground: FloatImage, moved: Array) -> FloatImage:
 def strips_of(
     amplitude: tuple[float, float], seed: int, derivative: Array, noise: float = 4.0
 ) -> tuple[ChipStrips, Array]:
-    """Strips of a chip in a scene that swings along the rows, and how far each is off (s, 2)."""
+    """Strips of a chip in a scene that oscillates along the rows, and how far each is off (s, 2)."""
     rng = np.random.default_rng(seed)
     ground = texture(rng)
     row = np.arange(SIDE, dtype=np.float64)

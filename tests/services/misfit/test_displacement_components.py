@@ -159,7 +159,7 @@ MOTIONS = {
     "distortion of the optics": bow(3.0, axis=1, degree=3),
     "bows over both": both(bow(6.0), bow(3.0, axis=1)),
     "yaw that drifts": both(yaw(8.0, 12_000.0), bow(2.0)),
-    "yaw that swings": yaw(4.0, 4_000.0),
+    "yaw that oscillates": yaw(4.0, 4_000.0),
     "scale that changes": yaw(0.0, 6_000.0, 5.0),
     "diagonal bow": diagonal(5.0),
     "jitter and a bow over samples": both(jitter(600.0, (1.0, 2.0)), bow(4.0, axis=1)),
@@ -301,14 +301,16 @@ def test_relief_that_turns_lines_is_named_and_not_followed() -> None:
         assert height.chance < MAX_CHANCE
 
 
-def test_lines_that_swing_above_hills_still_turn() -> None:
+def test_lines_that_oscillate_above_hills_still_turn() -> None:
     """Residuals that follow hills by chance, but lines far more clearly, are of no other view."""
     motion = both(jitter(2600.0, (2.0, 4.0)), yaw(3.0, 6_000.0, 3.0))
     for seed in range(3):
         observations, truth = draw(motion, np.random.default_rng(seed), wrong=0.0)
         lon_lat_h = observations.lon_lat_h.copy()
-        swings = motion(observations.line_sample)[:, 1]
-        lon_lat_h[:, 2] = 40.0 * swings + np.random.default_rng(seed).normal(0.0, 60.0, len(swings))
+        oscillating = motion(observations.line_sample)[:, 1]
+        lon_lat_h[:, 2] = 40.0 * oscillating + np.random.default_rng(seed).normal(
+            0.0, 60.0, len(oscillating)
+        )
         above_hills = replace(observations, lon_lat_h=lon_lat_h)
         result = adjust_scene(FlatModel(), SHAPE, above_hills, AdjustmentOptions())
         assert "swath" in {one.along for one in result.components}

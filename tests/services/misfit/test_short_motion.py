@@ -39,7 +39,7 @@ def still(line: Array) -> Array:
     return np.zeros((*line.shape, 2))
 
 
-def swing(period: float, size_px: tuple[float, float]) -> Motion:
+def oscillation(period: float, size_px: tuple[float, float]) -> Motion:
     def motion(line: Array) -> Array:
         turn = 2.0 * np.pi * line / period
         return np.stack([size_px[0] * np.sin(turn), size_px[1] * np.cos(turn + 1.0)], axis=-1)
@@ -81,9 +81,9 @@ def found(motion: Motion, seed: int, count: int = 100) -> ShortMotion:
 
 
 @pytest.mark.parametrize("period", [140.0, 200.0, 330.0, 600.0])
-def test_a_swing_shorter_than_chips_is_found_with_its_period_and_its_size(period: float) -> None:
+def test_an_oscillation_shorter_than_chips_is_found_with_its_period_and_its_size(period: float) -> None:
     size_px = (0.7, 1.5)
-    results = [found(swing(period, size_px), seed) for seed in range(8)]
+    results = [found(oscillation(period, size_px), seed) for seed in range(8)]
     assert all(one.structure.chance < MAX_CHANCE for one in results)
     assert [one.structure.at for one in results] == pytest.approx([period] * 8, rel=0.08)
     sizes = np.mean([np.sqrt(2.0 * one.variance_px2) for one in results], axis=0)
@@ -92,8 +92,10 @@ def test_a_swing_shorter_than_chips_is_found_with_its_period_and_its_size(period
     assert largest == pytest.approx(np.hypot(*size_px), rel=0.15)
 
 
-def test_several_swings_add_up() -> None:
-    motion = several(swing(130.0, (1.0, 0.0)), swing(210.0, (0.0, 1.5)), swing(370.0, (0.8, 0.8)))
+def test_several_oscillations_add_up() -> None:
+    motion = several(
+        oscillation(130.0, (1.0, 0.0)), oscillation(210.0, (0.0, 1.5)), oscillation(370.0, (0.8, 0.8))
+    )
     variance = np.mean([found(motion, seed).variance_px2 for seed in range(8)], axis=0)
     assert variance == pytest.approx([(1.0 + 0.64) / 2.0, (2.25 + 0.64) / 2.0], rel=0.2)
 
@@ -116,8 +118,8 @@ def test_the_chance_of_a_scene_that_does_not_move_is_what_it_says() -> None:
 
 
 @pytest.mark.monte_carlo
-def test_lines_of_a_scene_whose_samples_swing_get_less_than_chance_shows_of_them() -> None:
-    results = [found(swing(200.0, (0.0, 1.0)), seed, count=40) for seed in range(40)]
+def test_lines_of_a_scene_whose_samples_oscillate_get_less_than_chance_shows_of_them() -> None:
+    results = [found(oscillation(200.0, (0.0, 1.0)), seed, count=40) for seed in range(40)]
     contrasts = 40 * (STRIPS - 3)
     by_chance_px2 = 2.0 * NOISE_PX**2 / contrasts
     lines_px2, samples_px2 = np.mean([one.variance_px2 for one in results], axis=0)
@@ -141,7 +143,7 @@ def test_chips_that_overlap_are_no_further_evidence() -> None:
 def test_errors_of_the_points_and_the_order_of_the_points_do_not_count() -> None:
     rng = np.random.default_rng(3)
     place = chips(rng, 60)
-    shown = strips(swing(200.0, (1.0, 1.0)), place, rng)
+    shown = strips(oscillation(200.0, (1.0, 1.0)), place, rng)
     before = short_motion(shown, place, SIDE_PX)
     moved = replace(shown, displacement_px=shown.displacement_px + rng.normal(0.0, 30.0, (60, 1, 2)))
     order = rng.permutation(60)
@@ -152,7 +154,7 @@ def test_errors_of_the_points_and_the_order_of_the_points_do_not_count() -> None
 def test_few_or_unknown_strips_show_nothing() -> None:
     rng = np.random.default_rng(4)
     place = chips(rng, 60)
-    shown = strips(swing(200.0, (3.0, 3.0)), place, rng)
+    shown = strips(oscillation(200.0, (3.0, 3.0)), place, rng)
     unknown = replace(shown, displacement_px=np.full(shown.displacement_px.shape, np.nan))
     for some, where in ((shown.take(np.arange(5)), place[:5]), (unknown, place)):
         assert not short_motion(some, where, SIDE_PX).variance_px2.any()
@@ -204,14 +206,14 @@ def test_the_stated_accuracy_holds_motion_that_positions_of_chips_cannot_show(
     of_points_px: float,
 ) -> None:
     """However inaccurate the points are: strips of a chip share their errors."""
-    results = [adjusted(swing(180.0, (1.5, 2.0)), seed, of_points_px) for seed in range(10)]
+    results = [adjusted(oscillation(180.0, (1.5, 2.0)), seed, of_points_px) for seed in range(10)]
     assert 0.7 < np.mean([square for _, square in results]) < 1.5
     named = [one for result, _ in results for one in result.structures if one.family == "chips"]
     assert all(one.chance < MAX_CHANCE for one in named)
 
 
 def test_a_displacement_moves_the_strips_of_a_chip_as_the_motion_that_it_follows() -> None:
-    motion, place = swing(700.0, (2.0, 3.0)), chips(np.random.default_rng(7), 30)
+    motion, place = oscillation(700.0, (2.0, 3.0)), chips(np.random.default_rng(7), 30)
     line, sample = np.linspace(0.0, SHAPE[0] - 1.0, 2000), np.array([0.0, SHAPE[1] - 1.0])
     moved = np.repeat(motion(line)[:, None], 2, axis=1)
     grid = DisplacementGrid(line, sample, moved, np.zeros(moved.shape))
@@ -224,8 +226,8 @@ def test_a_displacement_moves_the_strips_of_a_chip_as_the_motion_that_it_follows
 
 @pytest.mark.long
 def test_motion_that_is_followed_is_not_counted_again() -> None:
-    """A swing longer than chips moves their strips as well, until the correction follows it."""
-    results = [adjusted(swing(1200.0, (3.0, 3.0)), seed, 0.3) for seed in range(5)]
+    """An oscillation longer than chips moves their strips as well, until the correction follows it."""
+    results = [adjusted(oscillation(1200.0, (3.0, 3.0)), seed, 0.3) for seed in range(5)]
     assert all(result.components for result, _ in results)
     assert all(result.short_motion.variance_px2.max() < 0.05 for result, _ in results)
 
@@ -239,7 +241,7 @@ def test_repetitions_without_some_points_keep_the_motion() -> None:
         np.full(80, 0.3),
         np.zeros((80, 3, 3)),
         chip_side_px=SIDE_PX,
-        strips=strips(swing(180.0, (2.0, 2.0)), place, rng),
+        strips=strips(oscillation(180.0, (2.0, 2.0)), place, rng),
     )
     whole = adjust_scene(FlatModel(), SHAPE, observations)
     part = replace(observations, usable=np.arange(80) % 4 > 0)

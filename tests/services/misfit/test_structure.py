@@ -129,9 +129,12 @@ def test_a_bow_is_named_by_the_degree_that_explains_all_of_it(axis: int, degree:
 def test_no_period_is_looked_for_that_is_shorter_than_a_chip() -> None:
     residuals = independent(np.random.default_rng(75))
     phase = 2.0 * np.pi * residuals.line_sample[:, 0] / 150.0
-    swinging = replace(residuals, misfit=residuals.misfit + 8.0 * np.column_stack([np.sin(phase)] * 2))
+    oscillating = replace(
+        residuals, misfit=residuals.misfit + 8.0 * np.column_stack([np.sin(phase)] * 2)
+    )
     seen, hidden = (
-        structures(replace(swinging, chip_side_px=side_px), ("lines",))[0] for side_px in (100.0, 300.0)
+        structures(replace(oscillating, chip_side_px=side_px), ("lines",))[0]
+        for side_px in (100.0, 300.0)
     )
     assert seen.chance < 1e-6 < hidden.chance
     assert seen.at == pytest.approx(150.0, rel=0.02)

@@ -85,11 +85,11 @@ def test_a_step_says_where_it_is_and_what_it_looks_like(family: Family, words: s
 
 
 @pytest.mark.parametrize(("period", "cause"), [(3900.0, "attitude jitter"), (4100.0, "a bow")])
-def test_a_swing_longer_than_the_lines_of_an_image_is_a_bow(period: float, cause: str) -> None:
+def test_an_oscillation_longer_than_the_lines_of_an_image_is_a_bow(period: float, cause: str) -> None:
     """However many samples it has."""
-    swing = Structure("lines", 1e-9, "period", period, np.full(2, 2.0), 4.0, np.full(2, np.nan))
+    oscillation = Structure("lines", 1e-9, "period", period, np.full(2, 2.0), 4.0, np.full(2, np.nan))
     for samples in (500, 30_000):
-        (criterion,) = structure_criteria([swing], SIGHT, (SHAPE[0], samples), PREDICTED_PX)
+        (criterion,) = structure_criteria([oscillation], SIGHT, (SHAPE[0], samples), PREDICTED_PX)
         assert cause in criterion.note
 
 
@@ -101,7 +101,7 @@ def behind_breaks(line: list[float], followed: bool = True) -> Criterion:
     return breaks_criterion(BREAKS, np.array(line), followed, LINES)
 
 
-def test_a_swing_is_told_by_its_largest_displacement() -> None:
+def test_an_oscillation_is_told_by_its_largest_displacement() -> None:
     """A wave of 1 px reaches 1 px at its crests, and 0.71 px in the root mean square."""
     phase = np.linspace(0.0, 2.0 * np.pi, 1000, endpoint=False)
     size_px = np.array([np.sin(phase).std(), 3.0 * np.sin(phase).std()])
