@@ -31,8 +31,8 @@ class Family:
     Attributes:
         name: of the folder: `chips`, `scenes`, `results` or `uploads`.
         n_files: number of files.
-        given_up: keys of files that a row gives up: of removed scenes, of attempts without effect.
-        unknown: keys of files that no row knows.
+        given_up: keys of files that their row no longer needs: of removed scenes, of failed attempts.
+        unknown: keys of files without a row.
     """
 
     name: str
