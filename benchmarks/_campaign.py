@@ -1,188 +1,147 @@
-"""Scenes under difficult conditions, registered and compared with the truth."""
+"""A campaign: trials that run one after another or in processes, each outcome kept at once."""
 
-import time
-from dataclasses import dataclass, replace
+import hashlib
+import json
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from multiprocessing import get_context
+from multiprocessing.managers import SyncManager
+from pathlib import Path
+from queue import Empty, Queue
+from typing import Any, Generic, TypeVar, get_type_hints
 
-import numpy as np
+import cv2
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from amers.services.errors import AmersError
-from amers.services.imagery.scene import Scene
-from amers.services.quality.accuracy import accuracy, normalised_error
-from amers.services.quality.frames import frame_in_image
-from amers.services.quality.normal_law import normal_ce90
-from amers.services.registration.on_points import Registration, register_scene
-from amers.services.registration.options import RegistrationOptions
-from amers.services.simulation.tiles import Tiles
-from amers.services.types import Array, ChipSource, ControlPoints
-from benchmarks._scenes import Prepared, Truth, prepare
-from benchmarks._trials import Trial
-from benchmarks._worlds import Block, Place
-
-WRONG = 3.0
-"""A result is wrong when its CE90 exceeds the predicted CE90 this many times."""
-WRONG_PART = 0.1
-"""A result is wrong in part when this share of the image is wrong by that."""
+T = TypeVar("T")
+R = TypeVar("R")
+Named = list[tuple[str, T]]
+ROOT = Path(__file__).parent.parent
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """The outcome of one scene.
+class Log(Generic[R]):
+    """Outcomes in a file, a line each: pairs of what was tried and what became of it.
 
     Attributes:
-        verdict: "good", "usable" or "failed"; "refused" when there is no result.
-        reason: the unmet criteria, or why there is no result.
-        visible, matched, active: numbers of points.
-        order: of the correction.
-        ce90_before_m: of the delivered model, against the truth on the Earth, over the whole image.
-        ce90_m, ground_ce90_m: against the truth in the frame of the active points, and on the Earth.
-        predicted_m, predicted_worst_m: CE90 as stated, over the image and at its worst place.
-        normalised: mean square of true errors over stated deviations, over the image.
-        displacement_m: stability test, largest of the medians of the corners and the centre.
-        cpu_s: of the registration, with the rendering of the pixels that it reads and no run kept.
-        ground_predicted_m: CE90 on the Earth as stated, with the frame of the blocks; median.
-        ground_normalised: as `normalised`, on the Earth.
-        wrong_share: of the image that is off by more than `WRONG` times the CE90 predicted there.
-        judged_share: of the image: neither moved ground, nor shown twice. All else is left aside.
-        line_gap_px: median distance along lines from an active point to the next.
-        spacing_px: of the points that were searched, if they were evenly spread.
-        followable: whether a distortion is smooth enough for that spacing: its shortest period is at
-            least twice as long.
+        file: of the lines; a broken line is passed over.
+        kinds: the two dataclasses of a pair.
+        code: fingerprint of the sources that outcomes follow from.
+        any_code: whether outcomes of other sources count.
     """
 
-    verdict: str
-    reason: str
-    visible: int
-    matched: int
-    active: int
-    order: str
-    ce90_before_m: float
-    ce90_m: float
-    ground_ce90_m: float
-    predicted_m: float
-    predicted_worst_m: float
-    normalised: float
-    displacement_m: float
-    cpu_s: float
-    ground_predicted_m: float = float("nan")
-    ground_normalised: float = float("nan")
-    wrong_share: float = float("nan")
-    judged_share: float = 1.0
-    line_gap_px: float = float("nan")
-    spacing_px: float = float("nan")
-    followable: bool = False
+    file: Path
+    kinds: tuple[type, type]
+    code: str
+    any_code: bool = False
 
-    @property
-    def delivered(self) -> bool:
-        """Whether the verdict allows the use of the model."""
-        return self.verdict in ("good", "usable")
+    def read(self) -> dict[str, R]:
+        """Outcomes by name."""
+        outcomes: dict[str, Any] = {}
+        for line in self.file.read_text().splitlines() if self.file.exists() else ():
+            try:
+                record = json.loads(line)
+            except json.JSONDecodeError:
+                continue
+            if self.any_code or record["code"] == self.code:
+                parts = zip(self.kinds, (record["trial"], record["outcome"]), strict=True)
+                outcomes[record["name"]] = tuple(_loaded(kind, values) for kind, values in parts)
+        return outcomes
 
-    @property
-    def wrong(self) -> bool:
-        """Whether the true error is more than `WRONG` times the predicted one."""
-        return not self.ce90_m <= WRONG * self.predicted_m
-
-    @property
-    def wrong_on_earth(self) -> bool:
-        """Whether the true error on the Earth is more than `WRONG` times the predicted one."""
-        return not self.ground_ce90_m <= WRONG * self.ground_predicted_m
-
-    @property
-    def wrong_in_part(self) -> bool:
-        """Whether more than `WRONG_PART` of the image is wrong where its accuracy is predicted."""
-        return not self.wrong_share <= WRONG_PART
+    def append(self, name: str, result: R) -> None:
+        """Keep the outcome of a trial."""
+        trial, outcome = map(asdict, result)  # type: ignore[call-overload]
+        record = {"name": name, "code": self.code, "trial": trial, "outcome": outcome}
+        with self.file.open("a") as out:
+            out.write(json.dumps(record) + "\n")
 
 
-def attempt(
-    place: Place,
-    trial: Trial,
-    block: Block,
-    seed: int,
-    options: RegistrationOptions,
+def _loaded(kind: type, values: dict[str, Any]) -> Any:
+    """A dataclass from what `asdict` and JSON made of it: its dataclasses and tuples come back."""
+    hints = get_type_hints(kind)
+    for field in fields(kind):
+        value = values.get(field.name)
+        if isinstance(value, dict) and is_dataclass(hints[field.name]):
+            values[field.name] = _loaded(hints[field.name], value)
+        elif isinstance(value, list):
+            values[field.name] = tuple(value)
+    return kind(**values)
+
+
+def fingerprint(folder: str, *modules: str) -> str:
+    """A short hash of the sources below a folder and of some modules of the benchmarks."""
+    digest = hashlib.sha256()
+    drawn = [ROOT / "benchmarks" / f"_{name}.py" for name in modules]
+    for path in sorted((ROOT / folder).rglob("*.py")) + drawn:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def run_campaign(
+    trials: Mapping[str, T],
+    work: Callable[[T], R],
     *,
-    tiles: Tiles | None = None,
-) -> Outcome:
-    """The outcome of registering the scene of a trial; tiles as for `prepare`."""
-    prepared = prepare(place, trial, block, seed, tiles)
-    return registered(prepared, replace(block, points=prepared.points), options)[0]
+    jobs: int = 1,
+    stratum: Callable[[T], Hashable] = id,
+    log: Log[R] | None = None,
+    say: Callable[[str, R], object] = lambda name, result: None,
+) -> dict[str, R]:
+    """The outcomes of trials by name, in the order of the trials.
+
+    Args:
+        trials: by name; those that the log has are not run again.
+        work: what is done with a trial; the same trial gives the same outcome.
+        jobs: processes.
+        stratum: trials of one stratum run one after another in one process, and share what it makes.
+        log: keeps every outcome as soon as it is known.
+        say: receives each new outcome.
+    """
+    outcomes = {} if log is None else log.read()
+    missing = {name: trial for name, trial in trials.items() if name not in outcomes}
+    columns = TextColumn("trials"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns) as progress:
+        task = progress.add_task("", total=len(trials), completed=len(trials) - len(missing))
+        for name, result in _run(_groups(missing, stratum), work, jobs):
+            outcomes[name] = result
+            if log is not None:
+                log.append(name, result)
+            say(name, result)
+            progress.advance(task)
+    return {name: outcomes[name] for name in trials}
 
 
-def registered(
-    prepared: Prepared, chips: ChipSource, options: RegistrationOptions
-) -> tuple[Outcome, Registration | None]:
-    """The outcome of registering a scene, and the registration; None when it is refused."""
-    return outcome_of(prepared.scene, prepared.points, chips, options, prepared.truth())
+def _groups(trials: Mapping[str, T], stratum: Callable[[T], Hashable]) -> list[Named[T]]:
+    """Trials by stratum, the largest first."""
+    groups: dict[Hashable, Named[T]] = {}
+    for name, trial in trials.items():
+        groups.setdefault(stratum(trial), []).append((name, trial))
+    return sorted(groups.values(), key=len, reverse=True)
 
 
-def outcome_of(
-    scene: Scene, points: ControlPoints, chips: ChipSource, options: RegistrationOptions, truth: Truth
-) -> tuple[Outcome, Registration | None]:
-    """The outcome of registering a scene on points, and the registration; None when it is refused."""
-    start_s = time.process_time()
-    try:
-        registration = register_scene(scene, points, chips, options)
-    except AmersError as error:
-        cpu_s = time.process_time() - start_s
-        refused = Outcome("refused", str(error), 0, 0, 0, "", *[float("nan")] * 7, cpu_s)
-        return _with_spacing(refused, truth, scene, options), None
-    cpu_s = time.process_time() - start_s
-    measures = registration.measures
-    used = points.block[np.isin(points.id, measures.point_id[measures.active])]
-    outcome = _judged(scene, registration, truth, truth.in_frame(used), cpu_s)
-    return _with_spacing(outcome, truth, scene, options), registration
+def _run(
+    groups: list[list[tuple[str, T]]], work: Callable[[T], R], jobs: int
+) -> Iterator[tuple[str, R]]:
+    """Names and outcomes in the order in which they end."""
+    if jobs == 1:
+        yield from ((name, work(trial)) for group in groups for name, trial in group)
+        return
+    context = get_context("spawn")
+    with SyncManager(ctx=context) as manager, ProcessPoolExecutor(jobs, context) as pool:
+        done: Queue[tuple[str, R]] = manager.Queue()
+        futures = [pool.submit(_run_group, group, work, done) for group in groups]
+        for _ in range(sum(map(len, groups))):
+            while True:
+                try:
+                    yield done.get(timeout=1.0)
+                    break
+                except Empty:
+                    for future in futures:
+                        if future.done():
+                            future.result()
 
 
-def _with_spacing(outcome: Outcome, truth: Truth, scene: Scene, options: RegistrationOptions) -> Outcome:
-    """The outcome with the spacing of the searched points: by the truth, also where it is refused."""
-    searched = min(truth.shown_points, options.max_points or truth.shown_points)
-    spacing_px = float(np.sqrt(np.prod(scene.image.shape) / max(searched, 1)))
-    return replace(outcome, spacing_px=spacing_px, followable=truth.shortest_px >= 2.0 * spacing_px)
-
-
-def _judged(
-    scene: Scene, registration: Registration, truth: Truth, in_frame: Array, cpu_s: float
-) -> Outcome:
-    """The errors of a registration against the truth; the ground (n, 3) also as its points say."""
-    line_sample, shown = truth.line_sample, truth.on_earth
-
-    def error_px(ground: Array) -> Array:
-        return np.asarray(registration.model.project(ground) - line_sample)
-
-    derivative = registration.model.project_derivative(shown)
-    inverse = np.linalg.inv(derivative[:, :, :2])
-
-    def on_ground_m(error: Array) -> Array:
-        return np.asarray((inverse @ error[:, :, None])[:, :, 0])
-
-    def ce90_m(error: Array) -> float:
-        return accuracy(on_ground_m(error)).ce90_m.value
-
-    error, on_earth = error_px(in_frame), error_px(shown)
-    covariance = registration.adjustment.covariance_at(line_sample)
-    both = covariance + frame_in_image(registration.frame, derivative, registration.adjustment.apart_px)
-    local_m = normal_ce90(inverse @ covariance @ inverse.transpose(0, 2, 1))
-    right = np.hypot(*on_ground_m(error).T) <= WRONG * local_m
-    measures = registration.measures
-    lines = np.sort(measures.line_sample[measures.active, 0])
-    quality = registration.qualification
-    moved_m = [place.median_m for place in quality.stability.displacements]
-    return Outcome(
-        verdict=quality.verdict,
-        reason="; ".join(c.name for c in quality.criteria if not c.met),
-        visible=quality.point_counts.visible,
-        matched=quality.point_counts.matched,
-        active=quality.point_counts.active,
-        order=registration.adjustment.order,
-        ce90_before_m=ce90_m(scene.model.project(shown) - line_sample),
-        ce90_m=ce90_m(error),
-        ground_ce90_m=ce90_m(on_earth),
-        predicted_m=quality.predicted.overall_m,
-        predicted_worst_m=quality.predicted.worst_m,
-        normalised=normalised_error(error, covariance).mean_square,
-        displacement_m=max(moved_m, default=float("nan")),
-        cpu_s=cpu_s,
-        ground_predicted_m=quality.predicted.on_the_earth_overall_m,
-        ground_normalised=normalised_error(on_earth, both).mean_square,
-        wrong_share=float(1.0 - right.mean()),
-        judged_share=truth.judged_share,
-        line_gap_px=float(np.median(np.diff(lines))),
-    )
+def _run_group(group: Named[T], work: Callable[[T], R], done: "Queue[tuple[str, R]]") -> None:
+    cv2.setNumThreads(1)
+    for name, trial in group:
+        done.put((name, work(trial)))

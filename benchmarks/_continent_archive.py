@@ -19,7 +19,7 @@ from amers.services.simulation.archive import ArchiveView
 from amers.services.simulation.conditions import clouds_over
 from amers.services.simulation.tiles import TILE_PX
 from amers.services.types import Array
-from benchmarks._catalogue_files import write_catalogue
+from benchmarks._catalogue import write_catalogue
 from benchmarks._continent import Continent
 
 BITS = 12

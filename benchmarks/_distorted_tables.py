@@ -8,8 +8,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks._campaign import WRONG, WRONG_PART, Outcome
 from benchmarks._distortions import Drawn
+from benchmarks._outcome import WRONG, WRONG_PART, Outcome
 
 FALSE_ALARMS = 0.01
 FOLLOWED, NAMED = 0.8, 0.9

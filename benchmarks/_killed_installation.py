@@ -1,7 +1,8 @@
-"""An installation whose processes are killed at random and restarted, as by a service manager."""
+"""An installation whose processes are killed and restarted, and what it stands on fails for a while."""
 
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from types import TracebackType
 import httpx
 import psycopg
 
-from amers.app.db.cluster.embedded import Cluster
+from amers.app.db.cluster.embedded import DATABASE, SUPERUSER, Cluster
 from amers.app.db.engine import connect
 from amers.app.usecases.tokens import create_token
 from tests.service_process import free_port
@@ -27,6 +28,9 @@ WORKERS = 2
 LONGEST_REST_S = 1.0
 """Longest time until a killed process is restarted."""
 PATIENCE_S = 120.0
+OUTAGE_S = 6.0
+SETTING_S = 60.0
+"""Longest time until the database takes a new setting: it may be killed and recover meanwhile."""
 VICTIMS = ("supervisor", "api", "worker", "warm server", "attempt", "database")
 
 
@@ -270,3 +274,72 @@ def children(parent: int) -> list[int]:
             if int(stat.read_text().rpartition(")")[2].split()[1]) == parent:
                 pids.append(int(stat.parent.name))
     return pids
+
+
+@dataclass
+class Outages:
+    """Outages of an installation, one at a time, each in a thread of its own.
+
+    Attributes:
+        had: how many of each kind there were.
+        wrong: what was written where nothing should be.
+    """
+
+    installation: KilledInstallation
+    had: "Counter[str]" = field(default_factory=Counter)
+    wrong: list[str] = field(default_factory=list)
+    _threads: list[threading.Thread] = field(default_factory=list)
+
+    def begin(self, kind: str) -> None:
+        """Let an outage begin, of the `storage` or the `database`; it ends by itself."""
+        self.wait()
+        outage: Callable[[], None] = {"storage": self._unmount, "database": self._protect}[kind]
+        thread = threading.Thread(target=outage, name=f"outage of the {kind}")
+        self._threads.append(thread)
+        thread.start()
+
+    def wait(self) -> None:
+        """Wait until all outages are over."""
+        for thread in self._threads:
+            thread.join()
+
+    def _unmount(self) -> None:
+        """Leave an empty folder in the place of the storage, as an unmount does."""
+        folder = self.installation.folder / "storage"
+        away = folder.with_name("storage-away")
+        folder.rename(away)
+        folder.mkdir(0o755)
+        time.sleep(OUTAGE_S)
+        hidden = [str(path.relative_to(folder)) for path in folder.rglob("*")]
+        self.wrong += [f"{name}: written into the mount point" for name in hidden]
+        shutil.rmtree(folder)
+        away.rename(folder)
+        self.had["storage not mounted"] += 1
+
+    def _protect(self) -> None:
+        """Let the database refuse writes for a while."""
+        if self._set("alter system set default_transaction_read_only = on"):
+            time.sleep(OUTAGE_S)
+            self.had["database read-only"] += 1
+        if not self._set("alter system reset default_transaction_read_only"):
+            self.wrong.append("the database stayed read-only")
+
+    def _set(self, statement: str) -> bool:
+        """Change a setting of the server; returns whether it took it."""
+        dsn = self.installation.cluster.dsn(DATABASE, SUPERUSER)
+        deadline = time.monotonic() + SETTING_S
+        while time.monotonic() < deadline:
+            with (
+                suppress(psycopg.Error),
+                psycopg.connect(
+                    dsn,
+                    autocommit=True,
+                    connect_timeout=5,
+                    options="-c default_transaction_read_only=off",
+                ) as connection,
+            ):
+                connection.execute(statement.encode())
+                connection.execute("select pg_reload_conf()")
+                return True
+            time.sleep(0.2)
+        return False

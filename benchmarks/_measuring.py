@@ -1,11 +1,16 @@
-"""CPU times taken in turn, memory, and where figures are kept."""
+"""CPU times taken in turn, memory, the folder of a run, its table, and where figures are kept."""
 
 import json
+import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
 from typing import Any
+
+from rich.console import Console
+from rich.table import Table
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -39,3 +44,27 @@ def memory_mib(name: str) -> float:
     """
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) / 1024.0 for line in lines if line.startswith(f"{name}:"))
+
+
+@contextmanager
+def open_folder(prefix: str = "amers-bench-") -> Iterator[Path]:
+    """A temporary folder that the user of a database server can enter."""
+    with tempfile.TemporaryDirectory(prefix=prefix, dir="/tmp") as name:
+        Path(name).chmod(0o755)
+        yield Path(name)
+
+
+def print_table(
+    title: str,
+    rows: Iterable[Any],
+    columns: Mapping[str, Callable[[Any], object]],
+    *,
+    width: int | None = None,
+    caption: str | None = None,
+) -> None:
+    """Print a line for each row; a column is a function of the row, empty where that gives None."""
+    table = Table(*columns, title=title, caption=caption)
+    for row in rows:
+        cells = [cell(row) for cell in columns.values()]
+        table.add_row(*("" if cell is None else str(cell) for cell in cells))
+    Console(width=width).print(table)

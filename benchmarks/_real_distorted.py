@@ -1,8 +1,6 @@
 """Crops of real views, distorted by known maps, registered, and judged by ties."""
 
-import json
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +12,11 @@ from amers.services.registration.options import RegistrationOptions
 from amers.services.sensors.rpc import RpcModel
 from amers.services.simulation.distortion import DistortedImage, Distortion
 from amers.services.types import Array
-from benchmarks._campaign import Outcome, outcome_of
-from benchmarks._distorted_trials import DISTORTED
 from benchmarks._distortions import NOT_DISTORTED, Drawn, distortion_of
+from benchmarks._outcome import Outcome, outcome_of
 from benchmarks._real_views import VIEWS, RealView, real_view
 from benchmarks._scenes import Truth
+from benchmarks._trials import DISTORTED
 
 CLEAN = "clean"
 SCENES = {
@@ -88,17 +86,20 @@ def name_of(family: str, number: int) -> str:
     return f"{family}_{number:04d}"
 
 
-def view_of(number: int) -> str:
-    """The view of the scenes of a number."""
-    return VIEWS[number % len(VIEWS)]
+def number_of(name: str) -> int:
+    """The number of a scene."""
+    return int(name.rsplit("_", 1)[1])
+
+
+def view_of(name: str) -> str:
+    """The view of a scene."""
+    return VIEWS[number_of(name) % len(VIEWS)]
 
 
 def real_scene(name: str, seed: int, view: RealView) -> RealScene:
     """What is done to the scene of a name: everything follows from it and the seed."""
-    family, digits = name.rsplit("_", 1)
-    number = int(digits)
-    draw, key = DISTORTED.get(family, (None, 0))
-    rng = np.random.default_rng([seed, number, key, _KEY])
+    draw, key = DISTORTED.get(name.rsplit("_", 1)[0], (None, 0))
+    rng = np.random.default_rng([seed, number_of(name), key, _KEY])
     first = np.clip(view.placed.min(axis=0) - _BESIDE_PX, 0.0, None)
     last = np.minimum(view.placed.max(axis=0) + _BESIDE_PX, view.scene.image.shape) - view.crop
     corner = np.rint(rng.uniform(first, np.maximum(first, last))).astype(int).tolist()
@@ -107,7 +108,7 @@ def real_scene(name: str, seed: int, view: RealView) -> RealScene:
     shift_px = error_m / scene_gsd_m(view.scene) * np.array([np.sin(towards), np.cos(towards)])
     return RealScene(
         name,
-        view_of(number),
+        view_of(name),
         (corner[0], corner[1]),
         view.crop,
         (float(shift_px[0]), float(shift_px[1])),
@@ -119,7 +120,7 @@ def real_scene(name: str, seed: int, view: RealView) -> RealScene:
 def prepare_real(plan: RealScene, view: RealView, seed: int) -> RealPrepared:
     """A distorted crop, its model as delivered, and the truth at the ties that it shows."""
     shape, corner = (plan.size_px, plan.size_px), np.array(plan.corner, dtype=np.float64)
-    rng = np.random.default_rng([seed, int(plan.name.rsplit("_", 1)[1]), _KEY])
+    rng = np.random.default_rng([seed, number_of(plan.name), _KEY])
     distortion = distortion_of(plan.drawn, shape, scene_gsd_m(view.scene), rng)
     image = DistortedImage(view.scene.image, distortion, plan.corner)
     model = view.scene.model
@@ -143,35 +144,11 @@ def register_real(
     return prepared, outcome, registration
 
 
-def run_real(names: list[str], seed: int, real_data: Path) -> Iterator[tuple[str, Result]]:
-    """Yield names and results of scenes, view by view."""
-    for name in sorted(names, key=lambda name: (view_of(int(name.rsplit("_", 1)[1])), name)):
-        view = real_view(real_data, view_of(int(name.rsplit("_", 1)[1])))
-        plan = real_scene(name, seed, view)
-        yield name, (plan, register_real(plan, view, seed)[1])
-
-
-def read_real_outcomes(file: Path, code: str | None) -> dict[str, Result]:
-    """Outcomes by name, of the sources with a fingerprint, or of all when None; without broken lines."""
-    outcomes: dict[str, Result] = {}
-    for line in file.read_text().splitlines() if file.exists() else ():
-        try:
-            record = json.loads(line)
-        except json.JSONDecodeError:
-            continue
-        if code in (None, record["code"]):
-            plan = {**record["scene"], "drawn": Drawn(**record["scene"]["drawn"])}
-            for pair in ("corner", "shift_px"):
-                plan[pair] = tuple(plan[pair])
-            scene = RealScene(**plan)
-            outcomes[scene.name] = scene, Outcome(**record["outcome"])
-    return outcomes
-
-
-def real_outcome_line(code: str, result: Result) -> str:
-    """The line that keeps the outcome of a scene."""
-    scene, outcome = (asdict(part) for part in result)
-    return json.dumps({"code": code, "scene": scene, "outcome": outcome}) + "\n"
+def run_real(name: str, seed: int, real_data: Path) -> Result:
+    """What is done to the scene of a name, and its outcome."""
+    view = real_view(real_data, view_of(name))
+    plan = real_scene(name, seed, view)
+    return plan, register_real(plan, view, seed)[1]
 
 
 def _of_another_view(plan: RealScene, view: RealView, rng: np.random.Generator) -> RpcModel:

@@ -1,9 +1,11 @@
 """The scene of a trial: what a registration gets, and the truth about it."""
 
+from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -17,10 +19,11 @@ from amers.services.simulation.defects import Damage, DamagedImage
 from amers.services.simulation.detectors import Detectors
 from amers.services.simulation.distortion import Distortion
 from amers.services.simulation.render import surface_seen
-from amers.services.simulation.tiles import TiledView, Tiles
+from amers.services.simulation.tiles import TILE_PX, TiledView, Tiles
 from amers.services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
 from amers.services.simulation.world import World, with_smoother_terrain
 from amers.services.types import Array, ControlPoints, IntArray
+from benchmarks._campaign import fingerprint
 from benchmarks._distortions import distortion_of
 from benchmarks._point_errors import BlockErrors, spoil
 from benchmarks._trials import Trial
@@ -175,3 +178,38 @@ def _of_another_view(
         azimuth_deg=float(np.degrees(np.arctan2(*direction)) % 360.0),
     )
     return plan_geometry(world, other, rng, error_m).delivered
+
+
+def pixels_file(folder: Path, name: str) -> Path:
+    """The file of the pixels of a scene, as the sources draw it."""
+    drawing = fingerprint("services/simulation", "scenes", "distortions", "trials", "worlds")
+    return folder / f"pixels_{name}_{drawing}.npz"
+
+
+def read_tiles(file: Path) -> Tiles:
+    """The tiles of a scene that an earlier run rendered; none where there is no file."""
+    tiles: Tiles = OrderedDict()
+    if not file.exists():
+        return tiles
+    with np.load(file) as kept:
+        pixels, known = kept["pixels"], kept["known"]
+    for row, column in np.argwhere(known).tolist():
+        tiles[row, column] = pixels[_of_tile(row, column)].copy()
+    return tiles
+
+
+def keep_tiles(tiles: Tiles, shape: tuple[int, int], file: Path) -> None:
+    """Keep the tiles of a scene of lines and samples in a file."""
+    pixels = np.zeros(shape, dtype=np.uint16)
+    known = np.zeros([-(-size // TILE_PX) for size in shape], dtype=bool)
+    for (row, column), tile in tiles.items():
+        pixels[_of_tile(row, column)] = tile
+        known[row, column] = True
+    part = file.with_suffix(".part.npz")
+    np.savez(part, pixels=pixels, known=known)
+    part.replace(file)
+
+
+def _of_tile(row: int, column: int) -> tuple[slice, slice]:
+    starts = row * TILE_PX, column * TILE_PX
+    return slice(starts[0], starts[0] + TILE_PX), slice(starts[1], starts[1] + TILE_PX)

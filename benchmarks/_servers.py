@@ -4,7 +4,6 @@ import http.client
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -17,6 +16,7 @@ from urllib.parse import quote
 from psycopg.conninfo import conninfo_to_dict
 
 from amers.app.db.engine import Connection
+from tests.service_process import free_port
 from tests.statements import run_sql
 
 PATIENCE_S = 120.0
@@ -73,11 +73,11 @@ def show_to_peers(connection: Connection) -> None:
 def amers(data_folder: Path) -> Iterator[Server]:
     """`amers serve` without its worker and with public points."""
     settings = {"AMERS_DATA_FOLDER": str(data_folder), "AMERS_PUBLIC_POINTS": "true"}
-    port = _free_port()
+    port = free_port()
     command = [sys.executable, "-m", "amers", "serve", "--no-worker", "--port", str(port)]
     page = "limit=10000&f=json"
     tiles = "/collections/points/tiles/WebMercatorQuad"
-    with _running(command, settings) as process:
+    with running(command, _plain_environment() | settings) as process:
         yield _ready(Server("amers", process, port, "/collections/points/items", page, tiles), "/readyz")
 
 
@@ -94,19 +94,19 @@ def tipg(python: Path, dsn: str) -> Iterator[Server]:
         "TIPG_DB_SPATIAL_EXTENT": "false",
         "TIPG_DB_DATETIME_EXTENT": "false",
     }
-    port = _free_port()
+    port = free_port()
     command = [str(python), "-m", "uvicorn", "tipg.main:app", "--port", str(port), "--no-access-log"]
     items = f"/collections/{PEER_SCHEMA}.point/items"
     tiles = f"/collections/{PEER_SCHEMA}.point/tiles/WebMercatorQuad"
     page = "limit=10000&f=geojson"
-    with _running(command, settings) as process:
+    with running(command, _plain_environment() | settings) as process:
         yield _ready(Server("tipg", process, port, items, page, tiles), "/conformance")
 
 
 @contextmanager
 def pygeoapi(python: Path, dsn: str, folder: Path, threads: int) -> Iterator[Server]:
     """pygeoapi under gunicorn: one worker with one thread per client."""
-    port = _free_port()
+    port = free_port()
     configuration, description = folder / "pygeoapi.json", folder / "openapi.yml"
     configuration.write_text(json.dumps(_pygeoapi_document(port, conninfo_to_dict(dsn))))
     settings = {"PYGEOAPI_CONFIG": str(configuration), "PYGEOAPI_OPENAPI": str(description)}
@@ -114,12 +114,12 @@ def pygeoapi(python: Path, dsn: str, folder: Path, threads: int) -> Iterator[Ser
     subprocess.run(
         [str(python.parent / "pygeoapi"), *generate],
         check=True,
-        env={**_plain_environment(), **settings},
+        env=_plain_environment() | settings,
         capture_output=True,
     )
     command = [str(python), "-m", "gunicorn", "--workers", "1", "--threads", str(threads)]
     command += ["--bind", f"127.0.0.1:{port}", "--keep-alive", "60", "pygeoapi.flask_app:APP"]
-    with _running(command, settings) as process:
+    with running(command, _plain_environment() | settings) as process:
         server = Server("pygeoapi", process, port, "/collections/point/items", "limit=10000&f=json")
         yield _ready(server, "/conformance?f=json")
 
@@ -177,14 +177,12 @@ def _plain_environment() -> dict[str, str]:
 
 
 @contextmanager
-def _running(command: Sequence[str], settings: Mapping[str, str]) -> Iterator["subprocess.Popen[bytes]"]:
-    process = subprocess.Popen(
-        command,
-        env={**_plain_environment(), **settings},
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
+def running(
+    command: Sequence[str], environment: Mapping[str, str]
+) -> Iterator["subprocess.Popen[bytes]"]:
+    """A process without input and output, ended by SIGTERM, and after half a minute by SIGKILL."""
+    silent = subprocess.DEVNULL
+    process = subprocess.Popen(command, env=environment, stdin=silent, stdout=silent, stderr=silent)
     try:
         yield process
     finally:
@@ -210,10 +208,3 @@ def _ready(server: Server, path: str) -> Server:
             pass
         time.sleep(0.2)
     raise RuntimeError(f"{server.name} did not answer within {PATIENCE_S:g} s")
-
-
-def _free_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port: int = free.getsockname()[1]
-    return port

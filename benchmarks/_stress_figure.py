@@ -7,7 +7,7 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
-from benchmarks._campaign import WRONG, Outcome
+from benchmarks._outcome import WRONG, Outcome
 from benchmarks._trials import Trial
 
 mpl.use("Agg")

@@ -8,8 +8,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks._campaign import WRONG
-from benchmarks._families import Result
+from benchmarks._outcome import WRONG, Result
 
 NORMALISED = (0.7, 1.5)
 """Mean squares of normalised errors that are honest."""

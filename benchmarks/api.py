@@ -34,7 +34,7 @@ from amers.app.storage import Storage
 from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
 from benchmarks import _servers
 from benchmarks._filled import ROW_BLOCKS, Ground, fill
-from benchmarks._measuring import keep
+from benchmarks._measuring import keep, open_folder
 from benchmarks._servers import Server
 from tests.factories import make_block
 from tests.statements import run_sql
@@ -108,9 +108,7 @@ def main() -> None:
 @contextmanager
 def filled(count: int, console: Console) -> Iterator[Store]:
     """A store with this many points and one small block with chips, and our service on it."""
-    with tempfile.TemporaryDirectory(prefix="amers-bench-", dir="/tmp") as name, ExitStack() as stack:
-        folder = Path(name)
-        folder.chmod(0o755)
+    with open_folder() as folder, ExitStack() as stack:
         cluster = Cluster(folder / "postgres", durable=False)
         dsn = stack.enter_context(cluster.lease())
         revisions.upgrade(dsn)

@@ -11,43 +11,46 @@ Every layout is drawn many times with every limit and every share of blunders:
 
 A cell gives the share of points whose region holds their error relative to the median error of the
 block, the share whose region on the Earth does, the share of blocks whose frame does, east, north and
-up, and how many blocks were refused. A scene that took no part in the block is registered on its points
-(`benchmarks._block_scenes`), and the shares of its corners and centre are given likewise.
+up, and how many blocks were refused. A scene that took no part in the block is registered on its points,
+and the shares of its corners and centre are given likewise.
 Run: python -m benchmarks.block_coverage [--trials 40] [--layouts ring,pair] [--jobs 2]
 """
 
 import argparse
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import cache, partial
 from itertools import product
-from multiprocessing import get_context
 from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
-from rich.progress import track
 from rich.table import Table
 from scipy.stats import chi2
 
 from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
 from amers.services.adjustment.parameters import ImageParameters, image_parameters
 from amers.services.errors import ComputationError
-from amers.services.geodesy import lon_lat_h_from_east_north_up, metres_per_degree
-from amers.services.sensors.correction import no_correction
+from amers.services.geodesy import lon_lat_h_from_east_north_up, metres_per_degree, move_metres
+from amers.services.misfit.control_observations import ControlObservations
+from amers.services.misfit.image_correction import adjust_scene
+from amers.services.quality.stability import image_places
+from amers.services.sensors.correction import ImageCorrection, no_correction
 from amers.services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
 from amers.services.simulation.world import World, make_world
 from amers.services.types import Array, Observations
-from benchmarks._block_scenes import scene_held
+from benchmarks._campaign import run_campaign
 from benchmarks._measuring import keep
 
 SHAPE = (4000, 4000)
 GROUND_M = 150.0
 RELIEF_M = 60.0
 SHIFT_PX, SLOPE_PX, NOISE_PX, BLUNDER_PX = 3.0, 0.2, 0.2, 30.0
+MEASURE_SIGMA_PX = 0.1
 SEEN = 0.8
+MOST_POINTS = 300
+"""On which the scene is registered."""
 POINTS_PER_KM2 = 26.0
 LAYOUTS = ("ring", "pair", "star", "strip", "groups")
 DRIFTS_PX = (0.0, 0.3, 1.0)
@@ -112,8 +115,9 @@ def main() -> None:
     arguments = parser.parse_args()
     cases = [Case(*values) for values in product(arguments.layouts.split(","), DRIFTS_PX, BLUNDERS)]
     work = partial(measure, trials=arguments.trials, seed=arguments.seed)
-    with ProcessPoolExecutor(arguments.jobs, get_context("spawn")) as pool:
-        outcomes = list(track(pool.map(work, cases), "cells", len(cases)))
+    outcomes = list(
+        run_campaign({str(case): case for case in cases}, work, jobs=arguments.jobs).values()
+    )
     show(outcomes)
     keep("block_coverage", [asdict(outcome) for outcome in outcomes])
 
@@ -181,6 +185,63 @@ def holds(block: BlockAdjustment, truth: Array, case: Case, rng: np.random.Gener
     return Held(
         float(relative.mean()), float(on_earth.mean()), *map(float, of_frame), *of_scene, sigma_up_m
     )
+
+
+def scene_held(
+    block: BlockAdjustment,
+    truth: Array,
+    frame_error_m: Array,
+    scene: ViewGeometry,
+    correction: ImageCorrection,
+) -> tuple[float, float]:
+    """Shares of the corners and the centre of a scene whose regions hold the truth.
+
+    The scene sees the points where they truly are, with a noise of 0.1 px.
+
+    Args:
+        block: adjusted.
+        truth: (p, 3) of its points.
+        frame_error_m: (3,) east, north, up, that its points share.
+        scene: the geometry of the image, which took no part in the block.
+        correction: the true one.
+
+    Returns:
+        Share relative to the points, share on the Earth.
+    """
+    shape = scene.plan.shape
+    rng = np.random.default_rng(len(truth))
+    position = correction.apply(scene.rpc.project(truth))
+    seen = ((position >= 0.0) & (position <= np.array(shape) - 1.0)).all(axis=1)
+    seen = seen[: len(block.lon_lat_h)] & np.isfinite(block.lon_lat_h[:, 0])
+    rows = rng.permutation(np.flatnonzero(seen))[:MOST_POINTS]
+    to_px = scene.rpc.project_derivative(truth[rows]).mean(axis=0)
+    adjustment = adjust_scene(
+        scene.rpc,
+        shape,
+        ControlObservations(
+            lon_lat_h=block.lon_lat_h[rows],
+            line_sample=position[rows] + rng.normal(0.0, MEASURE_SIGMA_PX, (len(rows), 2)),
+            sigma_px=np.full(len(rows), MEASURE_SIGMA_PX),
+            covariance_m2=block.point_covariance_m2[rows],
+            deformation_px2=to_px @ block.frames[0].shared_m2 @ to_px.T,
+        ),
+    )
+    places = image_places(shape)
+    height_m = np.full(len(places), np.median(truth[rows, 2]))
+    ground = scene.rpc.locate(places, height_m)
+    in_block = move_metres(ground, np.tile(frame_error_m, (len(ground), 1)))
+    true_px = correction.apply(scene.rpc.project(ground))
+    covariance = adjustment.covariance_at(true_px)
+    by_ground = scene.rpc.project_derivative(ground)
+    frame = by_ground @ block.frames[0].covariance_m2 @ by_ground.transpose(0, 2, 1)
+    relative_px = adjustment.correction.apply(scene.rpc.project(in_block)) - true_px
+    on_earth_px = adjustment.correction.apply(scene.rpc.project(ground)) - true_px
+    return _share(relative_px, covariance), _share(on_earth_px, covariance + frame)
+
+
+def _share(error_px: Array, covariance: Array) -> float:
+    square = (error_px * np.linalg.solve(covariance, error_px[:, :, None])[:, :, 0]).sum(axis=1)
+    return float((square <= chi2.ppf(CONFIDENCE, 2)).mean())
 
 
 def whitened_square(error: Array, covariance: Array) -> Array:

@@ -11,18 +11,18 @@ Run: python -m benchmarks.cape_verde [--draws 12]
 """
 
 import argparse
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table
 
 from amers.services.quality.site_reach import SiteCheck, SiteReach, site_reach
 from amers.services.types import Array
+from benchmarks._campaign import run_campaign
 from benchmarks._cape_verde import SITES, STEREO, draw
-from benchmarks._measuring import keep
+from benchmarks._measuring import keep, print_table
 
 PUBLISHED = {
     ("GVAC", "GVBA"): (67, 0.83, 1.08),
@@ -82,25 +82,36 @@ def main() -> None:
 def measure(draws: int, seed: int) -> dict[str, object]:
     """All draws of both foundations, as tables and as figures."""
     reaches: dict[str, list[SiteReach]] = {name: [] for name in FOUNDATIONS}
-    for number in track(range(draws), description="draws"):
-        one = draw(np.random.default_rng([seed, number]))
-        for name, foundation in zip(FOUNDATIONS, (one.without(STEREO), one), strict=True):
-            reaches[name].append(
-                site_reach(foundation.images, foundation.observations, one.sites, one.heights)
-            )
+    for one in run_campaign({str(n): n for n in range(draws)}, partial(drawn, seed)).values():
+        for name, reach in zip(FOUNDATIONS, one, strict=True):
+            reaches[name].append(reach)
     outcome: dict[str, object] = {}
     for column, name in enumerate(FOUNDATIONS):
         rows = [carried(reaches[name], pair, column) for pair in PUBLISHED]
         largest = np.array([[check.residual_m for check in reach.checks] for reach in reaches[name]])
         show(name, rows, largest)
         corners = {active: corner_moves(reaches[name], active) for active in SITES}
-        show_corners(name, corners)
+        columns = {
+            "active": lambda row: row[0],
+            "median m": lambda row: f"{row[1][0]:.2f}",
+            "largest m": lambda row: f"{row[1][1]:.2f}",
+        }
+        print_table(f"{name}: corners of the ortho-images, 1 site or 4", corners.items(), columns)
         outcome[name] = {
             "rows": [vars(row) for row in rows],
             "largest_m_of_draws": largest.max(axis=1).round(3).tolist(),
             "corners_m": {active: moved.round(3).tolist() for active, moved in corners.items()},
         }
     return outcome
+
+
+def drawn(seed: int, number: int) -> tuple[SiteReach, ...]:
+    """What one site reaches in a draw, on each foundation."""
+    one = draw(np.random.default_rng([seed, number]))
+    return tuple(
+        site_reach(foundation.images, foundation.observations, one.sites, one.heights)
+        for foundation in (one.without(STEREO), one)
+    )
 
 
 def carried(reaches: list[SiteReach], pair: tuple[str, str], column: int) -> Carried:
@@ -141,39 +152,35 @@ def corner_moves(reaches: list[SiteReach], active: str) -> Array:
 
 def show(name: str, rows: list[Carried], largest_m: Array) -> None:
     """Print the published table with ours beside it."""
-    table = Table(
-        "active", "check", "km", "publ.", "draw 1", "rms", "max", "decl.", "norm.", "norm. up",
-        title=f"{name}: residual at the check site, m, {len(largest_m)} draws",
-    )  # fmt: skip
-    for row in rows:
-        figures = (row.published_m, row.first_m, row.rms_m, row.largest_m, row.declared_m)
-        squares = (row.normalised, row.normalised_up)
-        table.add_row(
-            row.active, row.check, f"{row.distance_km:.0f}", *(f"{one:.2f}" for one in figures + squares)
-        )
     normalised = np.mean([row.normalised for row in rows])
     published_m, rms_m = (
         np.sqrt(np.mean([getattr(row, member) ** 2 for row in rows]))
         for member in ("published_m", "rms_m")
     )
     largest = largest_m.max(axis=1)
-    table.caption = (
+    caption = (
         f"rms of all {published_m:.2f} m published, {rms_m:.2f} m here; normalised {normalised:.2f}; "
         f"largest residual of a draw: {np.median(largest):.2f} m in the middle, "
         f"at most {LARGEST_M} m in {np.mean(largest <= LARGEST_M):.0%} of the draws; of all residuals "
         f"{np.mean(largest_m <= LARGEST_M):.0%} are"
     )
-    Console().print(table)
-
-
-def show_corners(name: str, corners: dict[str, Array]) -> None:
-    """Print how far the corners of the ortho-images move."""
-    table = Table(
-        "active", "median m", "largest m", title=f"{name}: corners of the ortho-images, 1 site or 4"
+    print_table(
+        f"{name}: residual at the check site, m, {len(largest_m)} draws", rows, COLUMNS, caption=caption
     )
-    for active, moved in corners.items():
-        table.add_row(active, *(f"{one:.2f}" for one in moved))
-    Console().print(table)
+
+
+COLUMNS: dict[str, Callable[[Carried], object]] = {
+    "active": lambda row: row.active,
+    "check": lambda row: row.check,
+    "km": lambda row: f"{row.distance_km:.0f}",
+    "publ.": lambda row: f"{row.published_m:.2f}",
+    "draw 1": lambda row: f"{row.first_m:.2f}",
+    "rms": lambda row: f"{row.rms_m:.2f}",
+    "max": lambda row: f"{row.largest_m:.2f}",
+    "decl.": lambda row: f"{row.declared_m:.2f}",
+    "norm.": lambda row: f"{row.normalised:.2f}",
+    "norm. up": lambda row: f"{row.normalised_up:.2f}",
+}
 
 
 if __name__ == "__main__":

@@ -16,10 +16,8 @@ import argparse
 import json
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +26,11 @@ import numpy as np
 from rich.console import Console
 
 from amers.services.formats.block.reader import FolderChips, read_block
+from benchmarks._campaign import run_campaign
 from benchmarks._continent import SIZES, Continent, make_truth, open_continent
 from benchmarks._continent_archive import write_archive_catalogue, write_image
 from benchmarks._continent_control import write_control
-from benchmarks._continent_density import judge_density
-from benchmarks._continent_later import never_found, register_later
+from benchmarks._continent_judged import judge_density, never_found, register_later
 from benchmarks._continent_points import judge_points, true_places
 from benchmarks._measuring import keep, memory_mib
 
@@ -117,12 +115,7 @@ def make(
     names = [f"archive/images/{name}.tif" for name in continent.views]
     names += [f"later/{name}.tif" for name in continent.later]
     missing = [name for name in names if not (folder / name).exists()]
-    work = partial(_write, folder)
-    if jobs == 1:
-        peaks = [work(name) for name in missing]
-    else:
-        with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-            peaks = list(pool.map(work, missing))
+    peaks = run_campaign({name: name for name in missing}, partial(_write, folder), jobs=jobs).values()
     say(f"{len(missing)} images: {time.monotonic() - started:.0f} s")
     write_control(continent)
     seconds, peak_mib = time.monotonic() - started, max([*peaks, memory_mib("VmHWM")])

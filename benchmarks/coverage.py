@@ -19,15 +19,12 @@ Run: python -m benchmarks.coverage [--trials 200] [--jobs 2]
 """
 
 import argparse
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
-from multiprocessing import get_context
 
 import numpy as np
 from rich.console import Console
-from rich.progress import track
 from rich.table import Table
 from scipy.stats import binom
 
@@ -38,6 +35,7 @@ from amers.services.quality.normal_law import normal_ce90
 from amers.services.quality.stability import image_places
 from amers.services.sensors.correction import ImageCorrection, no_correction
 from amers.services.types import Array
+from benchmarks._campaign import run_campaign
 from benchmarks._measuring import keep
 
 SHAPE = (4000, 5000)
@@ -141,8 +139,9 @@ def main() -> None:
     arguments = parser.parse_args()
     cases = [Case(*values) for values in product(COUNTS, LAYOUTS, SHARED, LAWS)]
     work = partial(measure, trials=arguments.trials, seed=arguments.seed)
-    with ProcessPoolExecutor(arguments.jobs, get_context("spawn")) as pool:
-        outcomes = list(track(pool.map(work, cases), "cells", len(cases)))
+    outcomes = list(
+        run_campaign({str(case): case for case in cases}, work, jobs=arguments.jobs).values()
+    )
     show(outcomes)
     keep("coverage", [asdict(outcome) for outcome in outcomes])
 

@@ -17,10 +17,12 @@ import argparse
 import os
 import sys
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
 
+from benchmarks._campaign import Log, fingerprint, run_campaign
 from benchmarks._distorted_tables import (
     Distorted,
     accused,
@@ -29,16 +31,16 @@ from benchmarks._distorted_tables import (
     figures_of,
     show_distorted,
 )
-from benchmarks._families import fingerprint
 from benchmarks._measuring import RESULTS, keep
+from benchmarks._outcome import SOURCES, Outcome
 from benchmarks._real_distorted import (
     CLEAN,
     SCENES,
+    RealScene,
     Result,
     name_of,
-    read_real_outcomes,
-    real_outcome_line,
     run_real,
+    view_of,
 )
 from benchmarks._real_views import is_kept_apart
 from benchmarks._stress_tables import NORMALISED, show_acceptance
@@ -68,26 +70,29 @@ def main() -> None:
     }
     if arguments.name:
         names = {arguments.name.rsplit("_", 1)[0]: [arguments.name]}
-    code = fingerprint("real_views", "real_distorted")
-    file = arguments.folder / f"outcomes_{arguments.seed}.jsonl"
-    outcomes = read_real_outcomes(file, None if arguments.any_code else code)
-    missing = [name for some in names.values() for name in some if name not in outcomes]
-    with file.open("a") as out:
-        for name, result in run_real(missing, arguments.seed, Path(folder)):
-            outcomes[name] = result
-            out.write(real_outcome_line(code, result))
-            out.flush()
-            _tell(result)
+    outcomes = run_campaign(
+        {name: name for some in names.values() for name in some},
+        partial(run_real, seed=arguments.seed, real_data=Path(folder)),
+        stratum=view_of,
+        log=distorted_log(arguments.folder / f"outcomes_{arguments.seed}.jsonl", arguments.any_code),
+        say=_tell,
+    )
     kept = {family: _report(family, [outcomes[n] for n in some]) for family, some in names.items()}
     if not arguments.name:
         keep("distorted", kept)
 
 
-def _tell(result: Result) -> None:
+def distorted_log(file: Path, any_code: bool = False) -> Log[Result]:
+    """The outcomes in a file."""
+    code = fingerprint("services", *SOURCES, "real_views", "real_distorted")
+    return Log(file, (RealScene, Outcome), code, any_code)
+
+
+def _tell(name: str, result: Result) -> None:
     """Print the outcome of a scene."""
     scene, outcome = result
     Console(width=200).print(
-        f"{scene.name} {scene.view} {scene.drawn.kind or CLEAN}: {outcome.verdict}, "
+        f"{name} {scene.view} {scene.drawn.kind or CLEAN}: {outcome.verdict}, "
         f"CE90 {outcome.ce90_m:.2f} m, {outcome.predicted_m:.2f} m predicted, "
         f"{outcome.wrong_share:.0%} wrong, {outcome.active} active; {outcome.reason}",
         highlight=False,

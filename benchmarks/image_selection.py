@@ -31,8 +31,13 @@ from amers.services.production.image_selection import (
     with_cloud_from_masks,
 )
 from amers.services.types import Array, IntArray
-from benchmarks._catalogue import CENTRE_LON_LAT, KM_PER_DEGREE, SCENE_KM, simulate_catalogue
-from benchmarks._catalogue_files import write_catalogue
+from benchmarks._catalogue import (
+    CENTRE_LON_LAT,
+    KM_PER_DEGREE,
+    SCENE_KM,
+    simulate_catalogue,
+    write_catalogue,
+)
 from benchmarks._measuring import keep, memory_mib
 
 

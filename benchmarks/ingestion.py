@@ -11,7 +11,6 @@ import argparse
 import json
 import os
 import shutil
-import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -21,7 +20,7 @@ from amers.app.db.cluster.embedded import Cluster
 from amers.app.storage import Storage
 from amers.app.usecases.blocks.lifecycle import ingest_block
 from amers.services.formats.block.check import CHECKSUM_THREADS
-from benchmarks._measuring import keep
+from benchmarks._measuring import keep, open_folder
 from tests.factories import make_block
 
 IMAGES = 8
@@ -32,9 +31,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--points", type=int, default=10_000)
     arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="amers-bench-", dir="/tmp") as name:
-        folder = Path(name)
-        folder.chmod(0o755)
+    with open_folder() as folder:
         made = make_block(folder / "block", count=arguments.points, n_images=IMAGES, gsds_m=(2.0,))
         steps: dict[str, float] = {}
         last = [time.perf_counter(), "checking checksums"]

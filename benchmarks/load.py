@@ -14,7 +14,6 @@ import os
 import random
 import signal
 import sys
-import tempfile
 import threading
 import time
 from collections import Counter, defaultdict
@@ -31,7 +30,7 @@ from amers.app.db import engine
 from amers.app.storage import Storage
 from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
 from amers.app.usecases.tokens import create_token
-from benchmarks._measuring import keep
+from benchmarks._measuring import keep, open_folder
 from tests.app.flat_world import SIGMA_M, make_flat_world
 from tests.factories import make_block
 from tests.service_process import Service, until
@@ -309,9 +308,7 @@ def main() -> int:
     arguments = parser.parse_args()
     # The started processes end with this command, also when it is stopped.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(1))
-    with tempfile.TemporaryDirectory(prefix="amers-load-", dir="/tmp") as name:
-        folder = Path(name)
-        folder.chmod(0o755)
+    with open_folder("amers-load-") as folder:
         outcome = run(folder, arguments.clients, arguments.seconds, arguments.seed)
     print(json.dumps(outcome, indent=1))
     keep("load", outcome)

@@ -29,8 +29,6 @@ from statistics import median
 import numpy as np
 import rasterio
 from rasterio.windows import Window as RasterWindow
-from rich.console import Console
-from rich.table import Table
 
 from amers.services.formats.elevation.dem import read_dem
 from amers.services.formats.images.ortho import gdal_transform
@@ -41,7 +39,7 @@ from amers.services.orthorectification.rectify import OrthoOptions, choose_grid,
 from amers.services.sensors.rpc_fit import fit_rpc
 from amers.services.simulation.orbit import pushbroom_over
 from amers.services.types import Acquisition, FloatImage
-from benchmarks._measuring import keep
+from benchmarks._measuring import keep, print_table
 
 TOLERANCE_PX = 0.125
 GSD_M = 0.5
@@ -78,7 +76,8 @@ def main() -> None:
         return
     with tempfile.TemporaryDirectory(prefix="amers-") as folder:
         outcomes = measured(Path(folder), arguments.size, arguments.repeats)
-    show(outcomes)
+    title = "Orthorectification, one thread; differences of the mapping: 99 %, largest"
+    print_table(title, outcomes, COLUMNS, width=115)
     keep("orthorectify", [asdict(outcome) for outcome in outcomes])
 
 
@@ -247,29 +246,15 @@ def distances_px(image: FloatImage, other: FloatImage) -> tuple[float, float]:
     return float(np.quantile(distance, 0.99)), float(distance.max())
 
 
-def show(outcomes: list[Outcome]) -> None:
-    """Print the table."""
-    table = Table(
-        "kernel",
-        "implementation",
-        "band pixels",
-        "M band pixels/s",
-        "Amers is faster",
-        "from the model",
-        "from gdalwarp exact",
-        title="Orthorectification, one thread; differences of the mapping: 99 %, largest",
-    )
-    for o in outcomes:
-        table.add_row(
-            o.kernel,
-            o.implementation,
-            f"{2 * o.map_pixels:,}",
-            f"{o.megapixels_per_s:.1f}",
-            f"{o.amers_is_faster:.1f} x",
-            "{:.3f}, {:.3f} px".format(*o.from_model_px),
-            "{:.3f}, {:.3f} px".format(*o.from_exact_px),
-        )
-    Console(width=115).print(table)
+COLUMNS: dict[str, Callable[[Outcome], object]] = {
+    "kernel": lambda o: o.kernel,
+    "implementation": lambda o: o.implementation,
+    "band pixels": lambda o: f"{2 * o.map_pixels:,}",
+    "M band pixels/s": lambda o: f"{o.megapixels_per_s:.1f}",
+    "Amers is faster": lambda o: f"{o.amers_is_faster:.1f} x",
+    "from the model": lambda o: "{:.3f}, {:.3f} px".format(*o.from_model_px),
+    "from gdalwarp exact": lambda o: "{:.3f}, {:.3f} px".format(*o.from_exact_px),
+}
 
 
 if __name__ == "__main__":

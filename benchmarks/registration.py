@@ -19,7 +19,6 @@ import argparse
 import cProfile
 import multiprocessing
 import pstats
-import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -54,7 +53,7 @@ from amers.services.simulation.tiles import TiledView
 from amers.services.simulation.view import ViewPlan, plan_geometry
 from amers.services.simulation.world import World, make_world
 from amers.services.types import Array, ControlPoints
-from benchmarks._measuring import keep, memory_mib
+from benchmarks._measuring import keep, memory_mib, open_folder
 from benchmarks._simulated import lay_points
 
 GSD_M = 0.5
@@ -142,8 +141,8 @@ def main() -> None:
     arguments = parser.parse_args()
     outcomes = []
     for size in map(int, arguments.sizes.split(",")):
-        with tempfile.TemporaryDirectory(prefix="amers-bench-", dir="/tmp") as name:
-            outcomes.append(measure(Path(name), size, arguments.repeats))
+        with open_folder() as folder:
+            outcomes.append(measure(folder, size, arguments.repeats))
     show(outcomes)
     keep("registration", {"scenes": [asdict(outcome) for outcome in outcomes]})
 

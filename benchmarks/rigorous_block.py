@@ -6,53 +6,113 @@
 Run: python -m benchmarks.rigorous_block
 """
 
+import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from amers.services.adjustment.bundle import adjust_block
+from amers.services.adjustment.control_ground import ControlGround
 from amers.services.adjustment.parameters import AdjustableImage, image_parameters
 from amers.services.adjustment.rigorous_parameters import rigorous_parameters
-from amers.services.geodesy import lon_lat_h_from_east_north_up
+from amers.services.geodesy import lon_lat_h_from_east_north_up, move_metres
+from amers.services.sensors.base import SensorModel
 from amers.services.sensors.parameter_sets import SRP
 from amers.services.sensors.pushbroom import PushbroomModel
 from amers.services.sensors.rpc_fit import fit_rpc
 from amers.services.simulation.orbit import pushbroom_over
-from amers.services.types import Array
-from benchmarks._measuring import keep
-from benchmarks._rigorous_block import Truth, drawn
+from amers.services.types import Array, Frame, IntArray, Observations
+from benchmarks._measuring import keep, print_table
 
 PLACE = np.array([-8.0, 31.6, 500.0])
 SHAPE, GSD_M, HEIGHTS_M = (6000, 6000), 1.5, (300.0, 1200.0)
 SIGMA_M, NOISE_PX, CONTROL_M = 6.0, 0.2, (0.5, 0.8)
 SIDE_M = SHAPE[0] * GSD_M
-console = Console()
+EXACT = Frame.from_sigmas(0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a simulation knows.
+
+    Attributes:
+        images: as delivered.
+        models: as they are: off by draws of the a priori standard deviations of their parameters.
+        lon_lat_h: (p, 3) points.
+    """
+
+    images: Sequence[AdjustableImage]
+    models: Sequence[SensorModel]
+    lon_lat_h: Array
+
+    def observed(
+        self, rng: np.random.Generator, noise_px: float, of: IntArray | None = None, most: int = 99
+    ) -> Observations:
+        """What the images show of points, with noise.
+
+        Args:
+            rng: source of it.
+            noise_px: standard deviation of a coordinate.
+            of: rows of the points, all by default.
+            most: images that show a point, at most.
+        """
+        of = np.arange(len(self.lon_lat_h)) if of is None else of
+        rows = []
+        for i, (image, model) in enumerate(zip(self.images, self.models, strict=True)):
+            position = model.project(self.lon_lat_h[of])
+            seen = ((position >= 0.0) & (position <= np.array(image.shape) - 1.0)).all(axis=1)
+            rows.append(np.column_stack([of[seen], np.full(seen.sum(), i), position[seen]]))
+        table = np.concatenate(rows)
+        table = table[np.lexsort((rng.random(len(table)), table[:, 0]))]
+        rank = np.arange(len(table)) - np.searchsorted(table[:, 0], table[:, 0])
+        table = table[rank < most]
+        table = table[np.lexsort((table[:, 1], table[:, 0]))]
+        return Observations(
+            table[:, 0].astype(np.int64),
+            table[:, 1].astype(np.int64),
+            table[:, 2:] + rng.normal(0.0, noise_px, (len(table), 2)),
+            np.full(len(table), noise_px),
+        )
+
+    def control(
+        self, rng: np.random.Generator, of: IntArray, sigma_m: tuple[float, float], frame: Frame = EXACT
+    ) -> ControlGround:
+        """Known ground of some points: horizontal and vertical standard deviation, and their frame."""
+        sigma = np.array([sigma_m[0], sigma_m[0], sigma_m[1]])
+        common_m = rng.multivariate_normal(np.zeros(3), frame.covariance_m2)
+        error_m = rng.normal(0.0, sigma, (len(of), 3)) + common_m
+        return ControlGround(
+            point=of.astype(np.int64),
+            lon_lat_h=move_metres(self.lon_lat_h[of], error_m),
+            covariance_m2=np.tile(np.diag(sigma**2), (len(of), 1, 1)),
+            source=np.zeros(len(of), dtype=np.int64),
+            frames=(frame,),
+            names=tuple(f"P{row + 1}" for row in of.tolist()),
+        )
+
+
+def drawn(images: Sequence[AdjustableImage], rng: np.random.Generator) -> list[SensorModel]:
+    """The models of images as they may be, by their a priori standard deviations."""
+    return [image.corrected(rng.normal(0.0, image.sigma)) for image in images]
 
 
 def main() -> None:
     """Print the table and keep its figures."""
-    table = Table(title="the whole adjustment, CPU seconds")
-    for name in ("scenes", "observations", "control", "rigorous", "RPC", "iterations"):
-        table.add_column(name)
-    outcome = []
-    # What is compiled is loaded before.
-    measured(*eleven_scenes())
-    for case in (eleven_scenes, hundred_scenes):
-        row = measured(*case())
-        outcome.append(row)
-        table.add_row(
-            str(row["scenes"]),
-            f"{row['observations']:,}",
-            f"{row['control']:,}",
-            f"{row['rigorous']['cpu_s']:.2f}",
-            f"{row['rpc']['cpu_s']:.2f}",
-            f"{row['rigorous']['iterations']}, {row['rpc']['iterations']}",
-        )
-    console.print(table)
+    argparse.ArgumentParser(description=__doc__).parse_args()
+    measured(*eleven_scenes())  # What is compiled is loaded before.
+    outcome = [measured(*case()) for case in (eleven_scenes, hundred_scenes)]
+    columns: dict[str, Callable[[dict[str, Any]], object]] = {
+        "scenes": lambda row: row["scenes"],
+        "observations": lambda row: f"{row['observations']:,}",
+        "control": lambda row: f"{row['control']:,}",
+        "rigorous": lambda row: f"{row['rigorous']['cpu_s']:.2f}",
+        "RPC": lambda row: f"{row['rpc']['cpu_s']:.2f}",
+        "iterations": lambda row: f"{row['rigorous']['iterations']}, {row['rpc']['iterations']}",
+    }
+    print_table("the whole adjustment, CPU seconds", outcome, columns)
     keep("rigorous_block", outcome)
 
 

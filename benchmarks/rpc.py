@@ -22,14 +22,12 @@ from pathlib import Path
 import numpy as np
 import rpcfast
 from rasterio.transform import RPCTransformer
-from rich.console import Console
-from rich.table import Table
 
 from amers.services.formats.images.raster import gdal_rpc
 from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
 from amers.services.sensors.rpc import RpcModel
 from amers.services.types import Array
-from benchmarks._measuring import cpu_medians_s, keep
+from benchmarks._measuring import cpu_medians_s, keep, print_table
 
 MODEL = Path(__file__).parents[1] / "tests" / "golden" / "invented_RPC.TXT"
 GDAL_FIRST_PIXEL = 0.5
@@ -100,7 +98,7 @@ def main() -> None:
             lambda variant: model.project(variant.result()),
             line_sample,
         )
-    show(outcomes)
+    print_table("RPC, one thread; largest differences", outcomes, COLUMNS, width=105)
     keep("rpc", [asdict(outcome) for outcome in outcomes])
 
 
@@ -219,29 +217,15 @@ def fast(model: RpcModel) -> rpcfast.RPCModel:
     return rpcfast.RPCModel(**{name: np.asarray(getattr(rpc, name)) for name in names})
 
 
-def show(outcomes: list[Outcome]) -> None:
-    """Print the table."""
-    table = Table(
-        "",
-        "implementation",
-        "points",
-        "M points/s",
-        "Amers is faster",
-        "from Amers",
-        "from the request",
-        title="RPC, one thread; largest differences",
-    )
-    for o in outcomes:
-        table.add_row(
-            o.direction,
-            o.implementation,
-            f"{o.points:,}",
-            f"{o.points_per_s / 1e6:.1f}",
-            f"{o.amers_is_faster:.1f} x",
-            f"{o.largest_difference_px:.1e} px",
-            "" if o.round_trip_px is None else f"{o.round_trip_px:.1e} px",
-        )
-    Console(width=105).print(table)
+COLUMNS: dict[str, Callable[[Outcome], object]] = {
+    "": lambda o: o.direction,
+    "implementation": lambda o: o.implementation,
+    "points": lambda o: f"{o.points:,}",
+    "M points/s": lambda o: f"{o.points_per_s / 1e6:.1f}",
+    "Amers is faster": lambda o: f"{o.amers_is_faster:.1f} x",
+    "from Amers": lambda o: f"{o.largest_difference_px:.1e} px",
+    "from the request": lambda o: None if o.round_trip_px is None else f"{o.round_trip_px:.1e} px",
+}
 
 
 if __name__ == "__main__":

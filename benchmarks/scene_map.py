@@ -11,8 +11,8 @@ Run: python -m benchmarks.scene_map
 import argparse
 import http.client
 import json
-import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -20,8 +20,6 @@ import cv2
 import numpy as np
 import rasterio
 from rasterio.windows import Window as RasterWindow
-from rich.console import Console
-from rich.table import Table
 
 from amers.app.db import engine, revisions
 from amers.app.db.cluster.embedded import Cluster
@@ -37,7 +35,7 @@ from amers.services.sensors.rpc import RpcModel
 from amers.services.sensors.rpc_fit import fit_rpc
 from amers.services.simulation.orbit import pushbroom_over
 from benchmarks import _servers
-from benchmarks._measuring import keep, memory_mib
+from benchmarks._measuring import keep, memory_mib, open_folder, print_table
 
 TARGET = (5.25, 44.2, 600.0)
 GSD_M = 0.5
@@ -86,23 +84,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", type=int, default=20_000, help="lines and samples of the scene")
     size = parser.parse_args().size
-    console = Console()
-    with tempfile.TemporaryDirectory(prefix="amers-bench-", dir="/tmp") as name:
-        folder = Path(name)
-        folder.chmod(0o755)
+    with open_folder() as folder:
         draw(folder, 500)  # Compiles.
         drawings = []
         for lines in (size // 4, size):
             drawing, mapped = draw(folder, lines)
             drawings.append(drawing)
         service = serve(folder, mapped)
-    table = Table("scene, px", "CPU, s", "highest memory, MiB", "tiles, MiB")
-    for one in drawings:
-        table.add_row(str(one.size), f"{one.cpu_s:.0f}", f"{one.highest_mib:.0f}", f"{one.file_mib:.0f}")
-    console.print(table)
-    console.print(
-        f"first tile {service.first_s:.3f} s; the next {service.tiles} in {service.next_s:.3f} s"
-    )
+    columns: dict[str, Callable[[Drawing], object]] = {
+        "scene, px": lambda one: one.size,
+        "CPU, s": lambda one: f"{one.cpu_s:.0f}",
+        "highest memory, MiB": lambda one: f"{one.highest_mib:.0f}",
+        "tiles, MiB": lambda one: f"{one.file_mib:.0f}",
+    }
+    print_table("", drawings, columns)
+    print(f"first tile {service.first_s:.3f} s; the next {service.tiles} in {service.next_s:.3f} s")
     keep("scene_map", {"drawings": [asdict(one) for one in drawings], "service": asdict(service)})
 
 

@@ -37,6 +37,7 @@ from amers.services.registration.on_points import register_scene
 from amers.services.simulation.view import ViewPlan, simulate_block, simulate_view
 from amers.services.simulation.world import make_world
 from benchmarks._measuring import keep
+from benchmarks._servers import running
 from tests.service_process import free_port, until
 
 SHAPE = (2000, 2000)
@@ -46,6 +47,7 @@ SKEW_PX = 1.0
 SIGMA_M = float(np.hypot(*ERROR_M))
 DISTINCT_SCENES = 2
 WORKERS = 2
+AMERS = (sys.executable, "-m", "amers")
 OPEN_JOBS = 6
 POLL_S = 2.0
 """Interval of the requests for the states of open jobs, which cost the API CPU time too."""
@@ -203,11 +205,16 @@ def by_service(folder: Path, images: list[Path]) -> dict[str, Any]:
     port = free_port()
     environment = {"AMERS_DATA_FOLDER": str(folder / "data"), "AMERS_LOG_LEVEL": "warning"}
     with ExitStack() as stack:
-        service = stack.enter_context(_running(["serve", "--port", str(port)], environment))
+        service = stack.enter_context(
+            running([*AMERS, "serve", "--port", str(port)], os.environ | environment)
+        )
         url = f"http://127.0.0.1:{port}"
         if not until(lambda: _answers(url)):
             raise RuntimeError(f"the service did not answer; exit code {service.poll()}")
-        others = [stack.enter_context(_running(["worker"], environment)) for _ in range(WORKERS - 1)]
+        others = [
+            stack.enter_context(running([*AMERS, "worker"], os.environ | environment))
+            for _ in range(WORKERS - 1)
+        ]
         _amers(["block", "ingest", str(folder / "block"), "--publish"], environment)
         words = ["token", "create", "throughput", "--scope", "register", "--json"]
         secret = json.loads(_amers(words, environment))["secret"]
@@ -264,26 +271,10 @@ def _register_all(client: httpx.Client, images: list[Path]) -> None:
 
 def _amers(words: list[str], environment: dict[str, str]) -> str:
     """The standard output of a command that succeeds."""
-    command = [sys.executable, "-m", "amers", *words]
     done = subprocess.run(
-        command, env=os.environ | environment, stdout=subprocess.PIPE, text=True, check=True
+        [*AMERS, *words], env=os.environ | environment, stdout=subprocess.PIPE, text=True, check=True
     )
     return done.stdout
-
-
-@contextmanager
-def _running(words: list[str], environment: dict[str, str]) -> Iterator["subprocess.Popen[bytes]"]:
-    command = [sys.executable, "-m", "amers", *words]
-    process = subprocess.Popen(command, env=os.environ | environment, stdin=subprocess.DEVNULL)
-    try:
-        yield process
-    finally:
-        process.terminate()
-        try:
-            process.wait(60.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
 
 
 def _answers(url: str) -> bool:

@@ -10,13 +10,11 @@ Run: python -m benchmarks.together [--blocks marrakech,wrong,nigeria]
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from amers.services.imagery.scene import scene_gsd_m
 from amers.services.joint.block import JointBlock
@@ -39,7 +37,7 @@ from benchmarks._joint_scenes import (
     places,
     tie_points,
 )
-from benchmarks._measuring import keep
+from benchmarks._measuring import keep, print_table
 
 OPTIONS = RegistrationOptions(max_points=0)
 RELIEF_M = 60.0
@@ -257,44 +255,28 @@ def show(
     name: str, rows: Sequence[Row], left: Sequence[str], published: dict[str, Published], cpu_s: float
 ) -> None:
     """Print the tables of one block: ours / published."""
-    table = Table(
-        title=f"{name}: ours / published, metres; {cpu_s:.0f} s of CPU time", title_justify="left"
-    )
-    heads = ("image", "visible", "matched", "active", "residual mean", "std", "ground x, y, Z std")
-    for head in (
-        *heads,
-        "80 %: moved",
-        "held out mean, std",
-        "verdict",
-        "CE90",
-        "error",
-        "alone",
-        "Earth",
-    ):
-        table.add_column(head, justify="left" if head == "image" else "right")
-    for row in rows:
-        of = published[row.name]
-        ground = ", ".join(f"{value:.2f}" for value in row.ground_std_m)
-        table.add_row(
-            row.name,
-            f"{row.visible} / {of.visible}",
-            f"{row.matched} / {of.matched}",
-            f"{row.active} / {of.active}",
-            f"{row.mean_m:.2f} / {of.residual_m[0]:.1f}",
-            f"{row.std_m:.2f} / {of.residual_m[1]:.1f}",
-            f"{ground} / {', '.join(map(str, of.ground_m))}",
-            f"{row.moved_m:.2f}",
-            f"{row.held_mean_m:.2f}, {row.held_std_m:.2f}",
-            row.verdict,
-            f"{row.ce90_m:.2f}",
-            f"{row.error_m:.2f}",
-            f"{row.alone_error_m:.2f}",
-            f"{row.earth_error_m:.2f}",
-        )
-    console = Console(width=200)
-    console.print(table)
+    columns: dict[str, Callable[[Row], object]] = {
+        "image": lambda row: row.name,
+        "visible": lambda row: f"{row.visible} / {published[row.name].visible}",
+        "matched": lambda row: f"{row.matched} / {published[row.name].matched}",
+        "active": lambda row: f"{row.active} / {published[row.name].active}",
+        "residual mean": lambda row: f"{row.mean_m:.2f} / {published[row.name].residual_m[0]:.1f}",
+        "std": lambda row: f"{row.std_m:.2f} / {published[row.name].residual_m[1]:.1f}",
+        "ground x, y, Z std": lambda row: (
+            f"{', '.join(f'{value:.2f}' for value in row.ground_std_m)}"
+            f" / {', '.join(map(str, published[row.name].ground_m))}"
+        ),
+        "80 %: moved": lambda row: f"{row.moved_m:.2f}",
+        "held out mean, std": lambda row: f"{row.held_mean_m:.2f}, {row.held_std_m:.2f}",
+        "verdict": lambda row: row.verdict,
+        "CE90": lambda row: f"{row.ce90_m:.2f}",
+        "error": lambda row: f"{row.error_m:.2f}",
+        "alone": lambda row: f"{row.alone_error_m:.2f}",
+        "Earth": lambda row: f"{row.earth_error_m:.2f}",
+    }
+    print_table(f"{name}: ours / published, metres; {cpu_s:.0f} s of CPU time", rows, columns, width=200)
     for reason in left:
-        console.print(f"left: {reason}")
+        print(f"left: {reason}")
 
 
 if __name__ == "__main__":

@@ -29,9 +29,9 @@ from amers.services.sensors.parameter_sets import TOUTIN
 from amers.services.simulation.orbit import pushbroom_over
 from amers.services.types import Array, IntArray, Observations
 from benchmarks._measuring import RESULTS, keep
-from benchmarks._rigorous_block import EXACT, Truth
-from benchmarks._rigorous_block import drawn as drawn_models
 from benchmarks._toutin_figure import draw_figure
+from benchmarks.rigorous_block import EXACT, Truth
+from benchmarks.rigorous_block import drawn as drawn_models
 
 PLACE = np.array([-75.75, 45.5, 100.0])
 HALF_EXTENT_M = (19_500.0, 27_800.0)
@@ -382,14 +382,6 @@ def main() -> None:
     draw_figure(outcome, RESULTS / "toutin.png")
 
 
-def titled(title: str, *names: str) -> Table:
-    """An empty table with columns."""
-    table = Table(title=title)
-    for name in names:
-        table.add_column(name)
-    return table
-
-
 def metres(values: Sequence[float]) -> str:
     """X, Y, Z, as far as known."""
     return ", ".join(f"{value:.2f}" for value in values if value > 0.0)
@@ -397,9 +389,9 @@ def metres(values: Sequence[float]) -> str:
 
 def residuals_on_control(trials: int) -> list[Any]:
     """Table 3: 125 control points and six tie points."""
-    table = titled(
-        "table 3: residuals on 125 control points, X, Y, Z, parallaxes in X and Y, m",
+    table = Table(
         "images", "published", "marks of 2.1 m", "marks of 3 m", "error / sigma",
+        title="table 3: residuals on 125 control points, X, Y, Z, parallaxes in X and Y, m",
     )  # fmt: skip
     rows = []
     for members, published in PUBLISHED_3.items():
@@ -413,9 +405,9 @@ def residuals_on_control(trials: int) -> list[Any]:
 
 def numbers_of_images(trials: int) -> list[Any]:
     """Tables 4 and 5, graph 4: six control points and one, two, three images; the same check points."""
-    table = titled(
-        "tables 4 and 5: six control points, check points X, Y, Z, m",
+    table = Table(
         "images", "published", "best points", "marks of 2.1 m", "marks of 3 m", "error / sigma",
+        title="tables 4 and 5: six control points, check points X, Y, Z, m",
     )  # fmt: skip
     rows = []
     for members, published in PUBLISHED_4.items():
@@ -424,23 +416,17 @@ def numbers_of_images(trials: int) -> list[Any]:
         figures = [metres(one.rms_m) for one in own]
         normalised = metres(own[0].normalised)
         table.add_row(str(len(members)), metres(published), metres(best), *figures, normalised)
-        rows.append(
-            {
-                "images": len(members),
-                "published": published,
-                "best": best,
-                "ours": [vars(one) for one in own],
-            }
-        )
+        ours = [vars(one) for one in own]
+        rows.append({"images": len(members), "published": published, "best": best, "ours": ours})
     console.print(table)
     return rows
 
 
 def graphs(trials: int) -> list[Any]:
     """Graphs 1 to 3: three to ten control points, every image, pair and all."""
-    table = titled(
-        "graphs 1 to 3: marks of 2.1 m, check points X, Y, Z, m",
+    table = Table(
         "images", "B/H", "published Z", *(f"{count} points" for count in COUNTS),
+        title="graphs 1 to 3: marks of 2.1 m, check points X, Y, Z, m",
     )  # fmt: skip
     rows = []
     for members in (*SINGLES, *PAIRS, ALL):
@@ -448,22 +434,17 @@ def graphs(trials: int) -> list[Any]:
         own = [with_points(count, members, POINTING_M[0], max(trials // 2, 2)) for count in COUNTS]
         ratio, published = BASE_TO_HEIGHT.get(members, 0.0), PUBLISHED_UP.get(members, 0.0)
         table.add_row(names, metres([ratio]), metres([published]), *(metres(one.rms_m) for one in own))
-        rows.append(
-            {
-                "images": names,
-                "ratio": ratio,
-                "published": published,
-                "points": COUNTS,
-                "ours": [vars(one) for one in own],
-            }
-        )
+        row = {"images": names, "ratio": ratio, "published": published, "points": COUNTS}
+        rows.append({**row, "ours": [vars(one) for one in own]})
     console.print(table)
     return rows
 
 
 def outside(trials: int) -> dict[str, Any]:
     """Six control points in the middle of the area, and all over it."""
-    table = titled("six control points, marks of 2.1 m, check points X, Y, Z, m", "", "ours", "worse")
+    table = Table(
+        "", "ours", "worse", title="six control points, marks of 2.1 m, check points X, Y, Z, m"
+    )
     out = {}
     whole, middle = extrapolated(0.5, POINTING_M[0], trials)
     worse = np.array(middle.rms_m) / whole.rms_m - 1.0
@@ -477,9 +458,9 @@ def outside(trials: int) -> dict[str, Any]:
 
 def poor_control(trials: int) -> dict[str, Any]:
     """Table 6: 50 control points that are off by 50 m, and what the orbit does for them."""
-    table = titled(
-        "table 6: 50 points of 50 m, 5 m in height, two images, marks of 2.1 m, X, Y, Z, m",
+    table = Table(
         "", "published", "ours", "error / sigma",
+        title="table 6: 50 points of 50 m, 5 m in height, two images, marks of 2.1 m, X, Y, Z, m",
     )  # fmt: skip
     draws = poor_draws(1.0, POINTING_M[0], 4 * trials)
     held, free = figure(draws), with_poor_points(NOT_HELD, POINTING_M[0], trials)

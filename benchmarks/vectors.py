@@ -26,8 +26,6 @@ import pyarrow as pa
 import rasterio
 import shapely
 from rasterio.transform import RPCTransformer
-from rich.console import Console
-from rich.table import Table
 
 from amers.app.usecases.registered_scene import SceneModel
 from amers.app.usecases.terrain_file import TerrainFile, read_terrain
@@ -47,7 +45,7 @@ from amers.services.types import Acquisition, Array, FloatImage
 from amers.services.vectors.accuracy import ErrorSources
 from amers.services.vectors.correct import correct_vectors
 from amers.services.vectors.shapes import Geometries, geometries_of, shapes_of
-from benchmarks._measuring import keep
+from benchmarks._measuring import keep, print_table
 
 CENTRE = np.array([5.2, 44.2, 900.0])
 GSD_M = 0.5
@@ -105,7 +103,7 @@ def main() -> None:
             dem = write_terrain(Path(folder) / "dem.tif", posting_deg, side_m, ripple_m)
             outcomes += vertices_only(name, model, dem, drawn, arguments.gdal_vertices)
             outcomes += whole(name, model, dem, drawn, shape)
-    show(outcomes)
+    print_table("", outcomes, COLUMNS, width=120)
     keep("vectors", [asdict(outcome) for outcome in outcomes])
 
 
@@ -241,20 +239,15 @@ def compared(one: Outcome, found: Array, expected: Array) -> Outcome:
     return replace(one, wrong=float(1.0 - right.mean()), largest_m=float(off_m[right].max()))
 
 
-def show(outcomes: list[Outcome]) -> None:
-    """Print the table."""
-    table = Table("terrain", "way", "vertices", "CPU s", "vertices/s", "elsewhere", "largest, m")
-    for one in outcomes:
-        table.add_row(
-            one.terrain,
-            one.way,
-            f"{one.vertices:,}",
-            f"{one.cpu_s:.2f}",
-            f"{one.vertices_per_s:,.0f}",
-            "" if one.wrong is None else f"{one.wrong:.2%}",
-            "" if one.largest_m is None else f"{one.largest_m:.3f}",
-        )
-    Console(width=120).print(table)
+COLUMNS: dict[str, Callable[[Outcome], object]] = {
+    "terrain": lambda o: o.terrain,
+    "way": lambda o: o.way,
+    "vertices": lambda o: f"{o.vertices:,}",
+    "CPU s": lambda o: f"{o.cpu_s:.2f}",
+    "vertices/s": lambda o: f"{o.vertices_per_s:,.0f}",
+    "elsewhere": lambda o: None if o.wrong is None else f"{o.wrong:.2%}",
+    "largest, m": lambda o: None if o.largest_m is None else f"{o.largest_m:.3f}",
+}
 
 
 if __name__ == "__main__":

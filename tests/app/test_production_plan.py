@@ -14,8 +14,7 @@ from amers.app.cli.main import main
 from amers.app.usecases.planning import read_plan
 from amers.services.formats.stac.catalogue import read_catalogue
 from amers.services.geodesy import metres_per_degree
-from benchmarks._catalogue import simulate_catalogue
-from benchmarks._catalogue_files import write_catalogue
+from benchmarks._catalogue import simulate_catalogue, write_catalogue
 
 FILES = {"points.csv", "report.html", "report.json", "manifest.json"}
 DEFAULTS = {

@@ -14,8 +14,7 @@ import shapely
 
 from amers.app.cli.main import main
 from amers.services.formats.stac.catalogue import read_catalogue
-from benchmarks._catalogue import simulate_catalogue
-from benchmarks._catalogue_files import write_catalogue
+from benchmarks._catalogue import simulate_catalogue, write_catalogue
 
 FILES = {"selection.json", "cells.gpkg", "overlap.csv", "report.html", "report.json", "manifest.json"}
 AREA = shapely.box(14.0, -1.0, 16.0, 1.0)

@@ -14,8 +14,7 @@ from rasterio.transform import Affine
 from amers.services.formats.vector.layers import VectorLayer, write_layer
 from amers.services.sensors.rpc import RpcModel
 from amers.services.types import Array, FloatImage
-from benchmarks._catalogue import simulate_catalogue
-from benchmarks._catalogue_files import write_catalogue
+from benchmarks._catalogue import simulate_catalogue, write_catalogue
 from tests.app.flat_world import GROUND_H, SIGMA_M, FlatWorld, make_flat_world
 from tests.app.joint_world import true_model, write_scene
 from tests.services.chip_bases import (

@@ -26,8 +26,14 @@ from amers.services.simulation.view import ViewPlan, plan_geometry
 from amers.services.types import Array, ControlPoints, Frame
 from benchmarks._continent import Continent
 from benchmarks._continent_control import DEM_SIGMA_M, FRAME_SIGMA_M, POINT_SIGMA_M
-from benchmarks._continent_density import counts, judge_density, textured_cells
-from benchmarks._continent_later import LaterScene, never_found, register_later
+from benchmarks._continent_judged import (
+    LaterScene,
+    counts,
+    judge_density,
+    never_found,
+    register_later,
+    textured_cells,
+)
 from benchmarks._continent_points import (
     PointVerdict,
     TruePlaces,

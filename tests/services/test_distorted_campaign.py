@@ -8,9 +8,8 @@ import pytest
 
 from amers.services.geodesy import move_metres
 from amers.services.registration.options import RegistrationOptions
-from benchmarks._campaign import Outcome, attempt, outcome_of
+from benchmarks._campaign import Log
 from benchmarks._distorted_tables import accused, by_kind, distorted_acceptance, figures_of
-from benchmarks._distorted_trials import DISTORTED, distorted_trial
 from benchmarks._distortions import (
     JITTER_PX,
     LONGEST_PERIOD,
@@ -22,9 +21,9 @@ from benchmarks._distortions import (
     Drawn,
     distortion_of,
 )
-from benchmarks._families import outcome_line, read_outcomes
+from benchmarks._outcome import Outcome, attempt, outcome_of
 from benchmarks._scenes import Prepared, prepare
-from benchmarks._trials import draw_trial
+from benchmarks._trials import DISTORTED, Trial, distorted_trial, draw_trial
 from benchmarks._worlds import Block, Place, block_of
 
 pytestmark = pytest.mark.long
@@ -198,9 +197,9 @@ def test_the_frame_of_points_of_several_blocks_is_the_earth(block: Block) -> Non
 
 def test_outcomes_of_distorted_scenes_are_read_back(tmp_path: Path) -> None:
     trial = distorted_trial("steps", SEED, 2, (SMALL,))
-    file = tmp_path / "outcomes.jsonl"
-    file.write_text(outcome_line("steps_00002", "a", (trial, RIGHT)))
-    assert read_outcomes(file, "a") == {"steps_00002": (trial, RIGHT)}
+    log = Log(tmp_path / "outcomes.jsonl", (Trial, Outcome), "a")
+    log.append("steps_00002", (trial, RIGHT))
+    assert log.read() == {"steps_00002": (trial, RIGHT)}
 
 
 def test_what_distorted_scenes_must_show_is_told_from_their_outcomes() -> None:

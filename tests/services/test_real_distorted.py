@@ -10,12 +10,11 @@ from benchmarks._distortions import NOT_DISTORTED, Drawn
 from benchmarks._real_distorted import (
     RealScene,
     prepare_real,
-    read_real_outcomes,
-    real_outcome_line,
     real_scene,
     register_real,
 )
 from benchmarks._real_views import RealView, real_view
+from benchmarks.distorted import distorted_log
 
 pytestmark = [pytest.mark.long, pytest.mark.real_data]
 
@@ -91,9 +90,10 @@ def test_an_image_stored_in_another_order_is_not_delivered(gizeh: RealView, kind
 def test_outcomes_are_read_back(gizeh: RealView, tmp_path: Path) -> None:
     plan = planned(gizeh, Drawn("mirrored"))
     outcome = register_real(plan, gizeh, SEED)[1]
-    file = tmp_path / "outcomes.jsonl"
-    file.write_text(real_outcome_line("a", (plan, outcome)) + '{"code": "a", "sc')
-    kept = read_real_outcomes(file, "a")
+    log = distorted_log(tmp_path / "outcomes.jsonl")
+    log.append(plan.name, (plan, outcome))
+    log.file.write_text(log.file.read_text() + '{"code": "a", "sc')
+    kept = log.read()
     assert list(kept) == [plan.name]
     assert kept[plan.name][0] == plan
     assert repr(kept[plan.name][1]) == repr(outcome)

@@ -12,8 +12,8 @@ from amers.services.imagery.source import Window
 from amers.services.registration.on_points import Registration, register_scene
 from amers.services.registration.options import RegistrationOptions
 from amers.services.types import Measures
-from benchmarks._campaign import Outcome, attempt
-from benchmarks._families import DRAWS, FAMILIES, outcome_line, read_outcomes
+from benchmarks._campaign import Log
+from benchmarks._outcome import Outcome, attempt
 from benchmarks._scenes import prepare
 from benchmarks._stress_tables import acceptance, as_without_damage, by_factor, summary
 from benchmarks._trials import (
@@ -26,6 +26,7 @@ from benchmarks._trials import (
     sensor_trial,
 )
 from benchmarks._worlds import Block, Place, block_of
+from benchmarks.stress import DRAWS, FAMILIES
 
 pytestmark = pytest.mark.long
 
@@ -163,13 +164,14 @@ def test_outcomes_are_read_back_without_a_broken_line(tmp_path: Path) -> None:
     trial = draw_trial(SEED, 0, (SMALL,))
     nothing = float("nan")
     outcome = Outcome("refused", "why", 0, 0, 0, "", *[nothing] * 7, 1.5)
-    line = outcome_line("trial_00000", "a", (trial, outcome)).strip()
-    file = tmp_path / "outcomes.jsonl"
-    file.write_text(line + "\n" + line[: len(line) // 2])
-    outcomes = read_outcomes(file, "a")
+    log = Log(tmp_path / "outcomes.jsonl", (Trial, Outcome), "a")
+    log.append("trial_00000", (trial, outcome))
+    line = log.file.read_text()
+    log.file.write_text(line + line[: len(line) // 2])
+    outcomes = log.read()
     assert list(outcomes) == ["trial_00000"]
     assert outcomes["trial_00000"][0] == trial
-    assert read_outcomes(file, "b") == {}
+    assert replace(log, code="b").read() == {}
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -19,7 +19,7 @@ from amers.services.sensors.refined import refined_rpc
 from amers.services.sensors.rpc_fit import fit_rpc
 from amers.services.simulation.orbit import pushbroom_over
 from amers.services.types import Array, Frame, Observations
-from benchmarks._rigorous_block import EXACT, Truth, drawn
+from benchmarks.rigorous_block import EXACT, Truth, drawn
 from tests.services.ties import difference_m
 
 TARGET = np.array([5.4, 43.6, 250.0])
