@@ -21,6 +21,7 @@ import psycopg
 from amers.app.db.cluster.embedded import DATABASE, SUPERUSER, Cluster
 from amers.app.db.engine import connect
 from amers.app.usecases.tokens import create_token
+from tests.app.worker_processes import children
 from tests.service_process import free_port
 
 LEASE_S = 2.0
@@ -264,16 +265,6 @@ class KilledInstallation:
         for _ in range(generation):
             alive = [child for one in alive for child in children(one)]
         return alive
-
-
-def children(parent: int) -> list[int]:
-    """The processes that a process has started."""
-    pids = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with suppress(OSError, IndexError):
-            if int(stat.read_text().rpartition(")")[2].split()[1]) == parent:
-                pids.append(int(stat.parent.name))
-    return pids
 
 
 @dataclass
