@@ -12,7 +12,7 @@ import sys
 import geopandas
 import matplotlib.pyplot as plt
 
-from amers.app.client import Client
+from amers import Client
 
 
 def query_points(bbox: str, url: str, token: str) -> geopandas.GeoDataFrame:

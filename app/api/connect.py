@@ -149,15 +149,16 @@ print(points[["saliency", "n_views", "geometry"]])
     ),
     Recipe(
         "Python client of Amers",
-        "Points and blocks, uploads, registrations and their results. It comes with Amers, and asks for "
-        "page after page by itself.",
+        "Points and blocks, uploads, registrations and their results; it asks for page after page by "
+        "itself. It comes with Amers. Where Amers is not installed, the package amers-client has it alone, "
+        "with httpx: write `from amers_client import Client`.",
         (
             Lines(
                 "python",
                 """
 from os import environ
 
-from amers.app.client import Client
+from amers import Client
 
 with Client("BASE", environ["TOKEN"]) as client:
     points = list(client.points((5.22, 43.21, 5.27, 43.26)))

@@ -7,7 +7,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand
 
-from amers.app.errors import AmersError
+from amers.app.cli.exit_status import is_refusal
 
 INPUT = re.compile(r"^[a-z_]+(?=: )|(?<=`)[a-z_]+(?=`)")
 """The name of an input in an error of the science or of a use case, which know no options."""
@@ -41,12 +41,14 @@ class CheckedCommand(TyperCommand):
         """Run the command.
 
         Raises:
-            AmersError: as the command raises it, with options in place of the names of inputs.
+            AmersError, RequestRefused: as the command raises it, with options in place of the names of
+                inputs.
         """
         try:
             return super().invoke(ctx)
-        except AmersError as error:
-            error.args = (by_options(str(error), ctx), *error.args[1:])
+        except Exception as error:
+            if is_refusal(error):
+                error.args = (by_options(str(error), ctx), *error.args[1:])
             raise
 
     def _problems(self, ctx: Any, args: list[str]) -> Iterator[str]:

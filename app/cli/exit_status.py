@@ -10,6 +10,8 @@
 | 130 | interrupted |
 """
 
+import sys
+
 from amers.app.errors import AmersError, ComputationError, PortInUse
 
 SUCCESS = 0
@@ -26,4 +28,13 @@ def exit_status(error: Exception) -> int:
         return NO_RESULT
     if isinstance(error, PortInUse):
         return PORT_IN_USE
-    return REFUSED if isinstance(error, AmersError) else FAILURE
+    return REFUSED if is_refusal(error) else FAILURE
+
+
+def is_refusal(error: Exception) -> bool:
+    """Whether the input or the request cannot be used, by Amers or by a service that was asked."""
+    if isinstance(error, AmersError):
+        return True
+    # Commands that ask no service do not import its client.
+    client = sys.modules.get("amers.app.client.errors")
+    return client is not None and isinstance(error, client.RequestRefused)

@@ -4,15 +4,15 @@ import traceback
 
 import typer
 
-from amers.app.cli.exit_status import FAILURE, REFUSED, exit_status
-from amers.app.errors import AmersError, StorageOutage, is_no_memory, is_no_room
+from amers.app.cli.exit_status import FAILURE, REFUSED, exit_status, is_refusal
+from amers.app.errors import StorageOutage, is_no_memory, is_no_room
 from amers.app.outages import outage_of
 from amers.app.printable import printable
 
 
 def failure(error: Exception) -> tuple[str, int]:
     """What to print for an error that ended a command, one sentence on one line, and the exit status."""
-    if isinstance(error, AmersError):
+    if is_refusal(error):
         return _one_line(error), exit_status(error)
     if isinstance(error, typer.TyperException):
         return _usage(error), REFUSED

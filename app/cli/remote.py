@@ -38,7 +38,8 @@ def register(
         The report as a document.
 
     Raises:
-        InputError: the scene cannot be used; RequestRefused: the service refuses a request.
+        InputError: the scene cannot be used.
+        RequestRefused: the service refuses a request.
         ComputationError: the scene could not be registered.
         ServiceFailure: the service does not answer, or not as expected.
     """

@@ -17,7 +17,7 @@ import typer
 from amers.app.cli.exit_status import FAILURE, NO_RESULT, SUCCESS, exit_status
 from amers.app.cli.progress import shown_progress
 from amers.app.cli.remote import register
-from amers.app.client import Client, RequestRefused, ServiceFailure
+from amers.app.client import Client, ServiceError
 from amers.app.config import Settings, read_settings
 from amers.app.db import engine
 from amers.app.db.engine import Database
@@ -183,11 +183,9 @@ def outcome_of(
             try:
                 outcome = registered_outcome(request, register_one(request, new, receiver))
             except (InputError, ComputationError) as error:
-                if isinstance(error, RequestRefused):
-                    raise
                 _keep_only_failure(request, new, error)
                 outcome = {**failed_outcome(request, error), "output": request.folder}
-    except (AmersError, ServiceFailure) as error:
+    except (AmersError, ServiceError) as error:
         return failed_outcome(request, error)
     return {**outcome, "seconds": round(time.monotonic() - started, 2)}
 

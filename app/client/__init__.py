@@ -1,8 +1,11 @@
-"""A Python client of an Amers service. Importing it loads httpx and nothing else of weight.
+"""A Python client of an Amers service: `from amers import Client`, or `from amers_client import Client`.
+
+It needs httpx alone. The distribution `amers-client` installs this folder as the package `amers_client`,
+so its modules import each other relatively, and nothing else of Amers.
 
 from pathlib import Path
 
-from amers.app.client import Client
+from amers_client import Client
 
 with Client("http://127.0.0.1:8000", token) as client:
     scene = client.upload_scene(Path("scene.tif"))
@@ -11,9 +14,9 @@ with Client("http://127.0.0.1:8000", token) as client:
     print(job.verdict)
 """
 
-from amers.app.client.client import Box, Client, Feature
-from amers.app.client.errors import JobFailed, RequestRefused, ServiceError, ServiceFailure
-from amers.app.client.job import Job, Progress
+from .client import Box, Client, Feature
+from .errors import JobFailed, RequestRefused, ServiceError, ServiceFailure
+from .job import Job, Progress
 
 __all__ = [
     "Box",

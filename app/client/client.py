@@ -9,10 +9,10 @@ from urllib.parse import quote
 
 import httpx
 
-from amers.app.client.connection import Connection
-from amers.app.client.errors import JobFailed, RequestRefused, ServiceFailure, is_transient
-from amers.app.client.job import Job, Progress, no_progress
-from amers.app.client.upload import upload_image
+from .connection import Connection
+from .errors import JobFailed, RequestRefused, ServiceFailure, is_transient
+from .job import Job, Progress, no_progress
+from .upload import upload_image
 
 POLL_S = 0.5
 TIMEOUT_S = 60.0

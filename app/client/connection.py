@@ -7,7 +7,7 @@ from typing import Any
 
 import httpx
 
-from amers.app.client.errors import RequestRefused, ServiceFailure
+from .errors import RequestRefused, ServiceFailure
 
 CHUNK_BYTES = 1 << 20
 

@@ -1,7 +1,6 @@
 """What can go wrong between a client and a service."""
 
-from amers.app.client.job import Job
-from amers.app.errors import InputError
+from .job import Job
 
 BUSY = (408, 429)
 """Statuses of refusals that are about the moment: too slow, too many."""
@@ -15,7 +14,7 @@ class ServiceFailure(ServiceError):
     """The service does not answer, or not as expected; the same request may succeed later."""
 
 
-class RequestRefused(ServiceError, InputError):
+class RequestRefused(ServiceError):
     """The service refuses a request, by the problem details of its reply (RFC 9457).
 
     Attributes:

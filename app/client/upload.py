@@ -5,9 +5,9 @@ from base64 import b64encode
 from collections.abc import Iterator
 from pathlib import Path
 
-from amers.app.client.connection import CHUNK_BYTES, Connection
-from amers.app.client.errors import RequestRefused, ServiceFailure
-from amers.app.client.job import Progress
+from .connection import CHUNK_BYTES, Connection
+from .errors import RequestRefused, ServiceFailure
+from .job import Progress
 
 TUS = {"Tus-Resumable": "1.0.0"}
 PIECE = "application/offset+octet-stream"
