@@ -26,11 +26,11 @@ RUN = {
     ("README.md", ". .venv/bin/activate"): f"{DEMO}::{FIRST_RUN}",
     (
         "README.md",
-        "from pathlib import Path",
+        "import amers",
     ): f"{DEMO}::test_the_python_of_the_readme_prints_the_verdict",
     ("README.md", "gdalinfo registered/scene.tif"): f"{DEMO}::test_gdal_reads_what_the_readme_makes",
     ("docs/guide.md", "from os import environ"): f"{DEMO}::test_the_python_of_the_guide_runs_as_it_is",
-    ("docs/guide.md", "from pathlib import Path"): f"{DEMO}::test_the_python_of_the_guide_runs_as_it_is",
+    ("docs/guide.md", "import amers"): f"{DEMO}::test_the_python_of_the_guide_runs_as_it_is",
     **{
         block.key: f"{DEMO}::test_the_curl_lines_of_the_guide_register_a_scene_and_read_points"
         for block in BLOCKS

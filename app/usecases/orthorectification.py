@@ -91,6 +91,14 @@ class Orthorectified:
     error_px: float
     vertical: str
 
+    def __repr__(self) -> str:
+        return (
+            f"Orthorectified {self.path}: {self.crs}\n"
+            f"  {self.lines} x {self.samples} pixels of {self.gsd_m:.2f} m, {self.bands} bands, "
+            f"{100.0 * self.seen:.0f} % with data\n"
+            f"  heights: {self.vertical}"
+        )
+
 
 @dataclass(frozen=True)
 class OrthorectifyScene:

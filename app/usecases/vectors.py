@@ -74,6 +74,14 @@ class CorrectedFile:
     unusable: dict[int, str]
     renamed: dict[str, str]
 
+    def __repr__(self) -> str:
+        relative, on_the_earth = self.relative_to_control_points, self.on_the_earth
+        return (
+            f"CorrectedFile {self.path}: {self.features} features, {self.vertices} vertices, {self.crs}\n"
+            f"  {relative.label}: {relative.words}\n"
+            f"  {on_the_earth.label}: {on_the_earth.words}"
+        )
+
 
 @dataclass(frozen=True)
 class ProjectedFile:

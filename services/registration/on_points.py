@@ -96,6 +96,16 @@ class Registration:
     frame: Frame
     qualification: Qualification
 
+    def __repr__(self) -> str:
+        counts, order = self.qualification.point_counts, self.adjustment.order
+        relative, on_the_earth = self.qualification.accuracy.lines
+        return (
+            f"Registration: {self.qualification.verdict}; {order} on {counts.active} of "
+            f"{counts.matched} points found, {counts.visible} in the scene\n"
+            f"  {relative}\n"
+            f"  {on_the_earth}"
+        )
+
 
 def register_scene(
     scene: Scene,

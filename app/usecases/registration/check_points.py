@@ -25,23 +25,35 @@ def read_check_points(path: Path, heights: str | None, image: Path, scene: Scene
     Raises:
         InputError: the file cannot be used, or has no check point of this scene.
     """
+    every = marks_of_scene(path, heights, image)
+    marks = every.take(every.check if every.check.any() else every.active)
+    if len(marks) == 0:
+        raise InputError(f"{path.name}: all {len(every)} points are switched off; switch some on")
+    lon_lat_h = ground_positions(marks, path, scene)
+    return CheckPoints(lon_lat_h, marks.line_sample, marks.sigma_m, marks.sigma_px)
+
+
+def marks_of_scene(path: Path, heights: str | None, image: Path) -> MarkedPoints:
+    """The marks of a file that are in one image.
+
+    Args:
+        path: of the file, in any format that `read_control_points` reads.
+        heights: vertical datum of its heights, where it states none; see `read_control_points`.
+        image: of the scene; a mark that names no image is in it.
+
+    Raises:
+        InputError: the file cannot be used, or has no mark in this image.
+    """
     marks = read_control_points(path, heights)
     names = np.char.lower(marks.image)
     is_in_scene = np.isin(names, ["", image.name.lower(), image.stem.lower()])
     if not is_in_scene.any():
         others = ", ".join(sorted(set(marks.image.tolist()))[:3]) or "no image"
         raise InputError(f"{path.name}: expected marks in {image.name}, found marks in {others}")
-    marks = marks.take(is_in_scene)
-    marks = marks.take(marks.check if marks.check.any() else marks.active)
-    if len(marks) == 0:
-        raise InputError(
-            f"{path.name}: all {int(is_in_scene.sum())} points are switched off; switch some on"
-        )
-    lon_lat_h = _ground_positions(marks, path, scene)
-    return CheckPoints(lon_lat_h, marks.line_sample, marks.sigma_m, marks.sigma_px)
+    return marks.take(is_in_scene)
 
 
-def _ground_positions(marks: MarkedPoints, path: Path, scene: Scene) -> Array:
+def ground_positions(marks: MarkedPoints, path: Path, scene: Scene) -> Array:
     """Ground positions (n, 3) of the points; missing heights are 0 where an ortho-image needs none."""
     missing = np.isnan(marks.lon_lat_h[:, 2])
     if missing.any() and not isinstance(scene.model, OrthoModel):

@@ -1,0 +1,445 @@
+"""The tasks of the library: refine, register, produce points, orthorectify, correct vectors.
+
+Each calls the use case that the command line and the service call; those have more options.
+"""
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from amers.app.usecases.executors import ComputeOptions
+from amers.app.usecases.image_production import ProductionImages, WorkPlace, run_production
+from amers.app.usecases.orthorectification import OrthoMap, Orthorectified, run_orthorectification
+from amers.app.usecases.production import BlockIdentity
+from amers.app.usecases.registered_scene import SceneModel
+from amers.app.usecases.registration.control_sources import points_of_block
+from amers.app.usecases.registration.on_marks import Refinement, read_marks, refine_on_marks, written
+from amers.app.usecases.registration.reference_source import (
+    CoveringReference,
+    ReferenceFiles,
+    given_reference,
+    register_on,
+)
+from amers.app.usecases.registration.register import ControlSources, SceneFiles, run_registration
+from amers.app.usecases.registration.result_folder import replacing
+from amers.app.usecases.registration.together import (
+    BLOCK_FOLDER,
+    JointPlace,
+    run_joint_registration,
+)
+from amers.app.usecases.terrain_file import TerrainFile
+from amers.app.usecases.vector_files import CorrectionOptions, VectorFile
+from amers.app.usecases.vectors import CorrectedFile, correct_file
+from amers.opened import (
+    Block,
+    FilePath,
+    Scene,
+    Terrain,
+    as_block,
+    as_scene,
+    ground_rows,
+    open_block,
+    rows_of,
+)
+from amers.services.errors import AmersError, InputError
+from amers.services.formats.vector.pixel_coordinates import PixelOrigin
+from amers.services.misfit.affine_fit import Order
+from amers.services.orthorectification.rectify import OrthoOptions
+from amers.services.production.from_images import ProductionOptions
+from amers.services.quality.check_points import MARKING_SIGMA_PX, CheckPoints
+from amers.services.quality.qualification import QualificationOptions
+from amers.services.registration.on_points import Registration, register_scene
+from amers.services.registration.options import RegistrationOptions
+from amers.services.reports.joint import JointReport
+from amers.services.types import Progress, no_progress
+
+
+@dataclass(frozen=True, repr=False)
+class JointRegistration:
+    """Scenes registered together.
+
+    Attributes:
+        registrations: of the scenes that fit, by the names of their images without suffix.
+        failed: why others were not registered, by the same names.
+        report: on all of them.
+    """
+
+    registrations: dict[str, Registration]
+    failed: dict[str, AmersError]
+    report: JointReport
+
+    def __repr__(self) -> str:
+        report = self.report
+        return (
+            f"JointRegistration: {report.verdict}; {report.verdict_words}\n"
+            f"  {report.active_control_points} of {report.control_points} control points, "
+            f"{report.tie_points} tie points\n"
+            f"  not registered: {', '.join(self.failed) or 'none'}"
+        )
+
+
+def refine(
+    scene: Scene | FilePath,
+    marks: FilePath | tuple[ArrayLike, ArrayLike],
+    folder: FilePath | None = None,
+    *,
+    heights: str | None = None,
+    sigma_px: float = MARKING_SIGMA_PX,
+    order: Order | None = None,
+) -> Refinement:
+    """Refine the model of a scene on known ground that you marked in its image.
+
+    Args:
+        scene: the scene or its path.
+        marks: file of marked points in any format that Amers reads (GeoJSON, CSV, QGIS, ASP, ENVI, ODM,
+            OPF, PCI); points that are switched off or are check points are not used. Or a pair: ground
+            positions (n, 3) of longitude, latitude, height above the ellipsoid, and where the image
+            shows them, (n, 2) line and sample.
+        folder: for files with the refined model. By default none are written.
+        heights: vertical datum of the heights of a file that does not state it; see `open_terrain`. By
+            default the file has to state it.
+        sigma_px: precision of marks that come without one, one standard deviation of each coordinate,
+            pixels. By default 0.5.
+        order: of the correction: "shift" needs two marks, "drift" three, "affine" four, one more than
+            determine it. By default None: it is selected by cross-validation, which needs four.
+
+    Raises:
+        InputError: a file cannot be used, or a latitude is beyond 90 degrees.
+        ComputationError: the marks are too few for the correction, or do not determine it.
+    """
+    opened = as_scene(scene)
+    files, content = opened.files, opened.content
+    if not sigma_px > 0.0:
+        raise InputError(f"sigma_px: {sigma_px:g} found, more than 0 px expected")
+    if isinstance(marks, FilePath):
+        read = read_marks(Path(marks), heights, files.image, content)
+    else:
+        read = _given_marks(*marks)
+    read = replace(read, sigma_px=np.nan_to_num(read.sigma_px, nan=sigma_px))
+    refinement = refine_on_marks(content, read, order)
+    if folder is None:
+        return refinement
+    return written(refinement, files.image, files.model, content, Path(folder))
+
+
+def register(
+    scene: Scene | FilePath,
+    block: Block | FilePath,
+    folder: FilePath | None = None,
+    *,
+    check_points: FilePath | None = None,
+    max_points: int = 500,
+    max_ce90_on_earth_m: float | None = None,
+    copy_image: bool = False,
+    progress: Progress = no_progress,
+) -> Registration:
+    """Refine the model of a scene on the control points of a block.
+
+    Args:
+        scene: the scene or its path.
+        block: the block or its folder.
+        folder: for the refined model, the report and the residuals; an older result in it is replaced as
+            a whole, and a failure leaves the folder as it is. By default nothing is written.
+        check_points: file of marked points that are held out, and lower the verdict when the result
+            contradicts them; needs a folder. By default none.
+        max_points: largest number of points that are tried, well spread over the image; more take
+            longer. By default 500; 0 tries all.
+        max_ce90_on_earth_m: a result whose CE90 on the Earth is larger is "failed", metres. By default
+            there is no limit.
+        copy_image: also write a copy of a GeoTIFF with the refined model in its tags; needs a folder. By
+            default not.
+        progress: receives the fraction done and a message. By default nothing does.
+
+    Returns:
+        With `model`, and with the verdict, the criteria and the accuracy in `qualification`.
+
+    Raises:
+        InputError: the scene, the block or the folder cannot be used.
+        ComputationError: the scene cannot be registered.
+    """
+    limits = QualificationOptions(max_ce90_on_earth_m=max_ce90_on_earth_m)
+    options = RegistrationOptions(max_points=max_points, qualification=limits)
+    if folder is not None:
+        sources = ControlSources(points_of_block(_folder_of(block)))
+        outputs = _Outputs(Path(folder), check_points, copy_image)
+        return _registered(scene, sources, outputs, options, progress)
+    _refuse_without_folder(check_points, copy_image)
+    control, content = as_block(block), as_scene(scene).content
+    return register_scene(content, control.points, control.chips, options, progress=progress)
+
+
+def register_on_reference(
+    scene: Scene | FilePath,
+    reference: FilePath,
+    terrain: Terrain | FilePath | None,
+    folder: FilePath | None = None,
+    *,
+    check_points: FilePath | None = None,
+    max_ce90_on_earth_m: float | None = None,
+    copy_image: bool = False,
+    progress: Progress = no_progress,
+) -> Registration:
+    """Refine the model of a scene on a reference ortho-image and its terrain, without control points.
+
+    Args:
+        scene: the scene or its path.
+        reference: ortho-image on a map.
+        terrain: heights of the same ground, open or the path of a file that states its vertical datum.
+            None only for a scene that is an ortho-image, which heights do not move.
+        folder, check_points, max_ce90_on_earth_m, copy_image, progress: as for `register`, with the same
+            defaults.
+
+    Returns:
+        As `register`; its points are the places that were matched.
+
+    Raises:
+        InputError: the scene, the reference or the folder cannot be used.
+        ComputationError: the scene cannot be registered.
+    """
+    limits = QualificationOptions(max_ce90_on_earth_m=max_ce90_on_earth_m)
+    options = RegistrationOptions(qualification=limits)
+    files = ReferenceFiles(Path(reference), None if terrain is None else _terrain_file(terrain))
+    if folder is not None:
+        sources = ControlSources(find_reference=given_reference(files))
+        outputs = _Outputs(Path(folder), check_points, copy_image)
+        return _registered(scene, sources, outputs, options, progress)
+    _refuse_without_folder(check_points, copy_image)
+    covering = CoveringReference(files.image.name, files)
+    return register_on(covering, as_scene(scene).content, options, progress)[0]
+
+
+def register_together(
+    scenes: Sequence[Scene | FilePath],
+    block: Block | FilePath,
+    folder: FilePath,
+    *,
+    copy_image: bool = False,
+    jobs: int = 1,
+    progress: Progress = no_progress,
+) -> JointRegistration:
+    """Refine the models of overlapping scenes in one adjustment, held together by tie points.
+
+    A scene that cannot be read or does not fit is left out, and does not stop the others.
+
+    Args:
+        scenes: scenes or their paths.
+        block: the block or its folder.
+        folder: gets a folder for each scene, named by its image, and one named "block" with the report
+            on all; older results in them are replaced.
+        copy_image: also write copies of GeoTIFFs with the refined models in their tags. By default not.
+        jobs: processes that search at once. By default 1: this process.
+        progress: receives the fraction done and a message. By default nothing does.
+
+    Raises:
+        InputError: no scene can be used, or a folder cannot be replaced.
+        ComputationError: no scene can be registered.
+    """
+    files = {one.image.stem: one for one in map(_files_of, scenes)}
+    if len(files) < len(scenes) or BLOCK_FOLDER in files:
+        raise InputError(
+            f"scenes: images with different names expected, none of them {BLOCK_FOLDER}: each gives its "
+            "name to the folder of its results"
+        )
+    with ExitStack() as stack:
+        place = Path(folder)
+        place.mkdir(parents=True, exist_ok=True)
+        new = {name: stack.enter_context(replacing(place / name)) for name in (*files, BLOCK_FOLDER)}
+        outcome = run_joint_registration(
+            files,
+            points_of_block(_folder_of(block)),
+            JointPlace(new.__getitem__, place.name, ComputeOptions(jobs)),
+            copy_image=copy_image,
+            progress=progress,
+        )
+    registrations = {name: one.registration for name, one in outcome.registered.items()}
+    return JointRegistration(registrations, outcome.failed, outcome.report)
+
+
+def produce_points(
+    images: Sequence[FilePath],
+    folder: FilePath,
+    *,
+    gsds_m: tuple[float, float] = (2.0, 20.0),
+    points: int = 300,
+    sigma_m: float | None = None,
+    licence: str = "proprietary",
+    jobs: int = 1,
+    progress: Progress = no_progress,
+) -> Block:
+    """Make a block of control points from overlapping images.
+
+    A report on the adjustment of the images is written into FOLDER.adjustment. When the same production
+    was interrupted, it goes on from where it was.
+
+    Args:
+        images: two or more, with their models inside or beside them.
+        folder: of the block, which gets its name; must not exist.
+        gsds_m: two ground samplings of the chips, finest first, metres: that of the scenes to register,
+            and one that is about ten times coarser, for models that are far off. By default 2 and 20.
+        points: number of points aimed at. By default 300.
+        sigma_m: accuracy of the models, one standard deviation of each coordinate, metres. By default
+            the figure of the producer, else that of the sensor, else 50 m.
+        licence: of points and chips, an SPDX identifier. By default "proprietary".
+        jobs: processes at once. By default 1: this process.
+        progress: receives the fraction done and a message. By default nothing does.
+
+    Returns:
+        The block that was written.
+
+    Raises:
+        InputError: an image cannot be used, or the folder exists.
+        ComputationError: the images do not make a block.
+    """
+    new = Path(folder)
+    run_production(
+        ProductionImages(tuple(map(Path, images)), sigma_m=sigma_m),
+        new,
+        BlockIdentity(new.name, license=licence),
+        ProductionOptions(*gsds_m, points=points),
+        place=WorkPlace(compute=ComputeOptions(jobs)),
+        progress=progress,
+    )
+    return open_block(new)
+
+
+def orthorectify(
+    scene: Scene | FilePath,
+    terrain: Terrain | FilePath,
+    output: FilePath,
+    *,
+    crs: str | None = None,
+    gsd_m: float | None = None,
+    hide: bool = False,
+    progress: Progress = no_progress,
+) -> Orthorectified:
+    """Write a scene with all its bands as a cloud-optimised GeoTIFF on a map.
+
+    Args:
+        scene: the scene or its path. Open it with `model=` and the file of a refined model for a map in
+            the right place.
+        terrain: the terrain, or the path of one that states its vertical datum.
+        output: path of the ortho-image; an existing file is replaced.
+        crs: reference system of the map, such as "EPSG:32631". By default the UTM zone of the scene.
+        gsd_m: ground sampling of the map, metres. By default that of the scene.
+        hide: write nodata for ground that other ground hides from the sensor. By default it shows what
+            hides it.
+        progress: receives the fraction done and a message. By default nothing does.
+
+    Raises:
+        InputError: the scene or the terrain cannot be used.
+        ComputationError: the mapping cannot be computed within a tenth of a pixel.
+    """
+    files = _files_of(scene)
+    return run_orthorectification(
+        files.image,
+        _terrain_file(terrain),
+        Path(output),
+        model=files.model,
+        ortho_map=OrthoMap(crs, gsd_m),
+        options=OrthoOptions(hide=hide),
+        progress=progress,
+    )
+
+
+def correct_vectors(
+    vectors: FilePath,
+    scene: Scene | FilePath,
+    terrain: Terrain | FilePath,
+    output: FilePath,
+    *,
+    registration: FilePath | None = None,
+    crs: str | None = None,
+    pixels: PixelOrigin = "qgis",
+    sigma_px: float = 0.5,
+) -> CorrectedFile:
+    """Bring vectors that were digitised on a raw scene onto the map, with their predicted accuracy.
+
+    Args:
+        vectors: GeoPackage, GeoJSON, shapefile or FlatGeobuf with one layer, in pixel coordinates of the
+            scene.
+        scene: the scene or its path.
+        terrain: the terrain, or the path of one that states its vertical datum.
+        output: file to write; its suffix is the format. An existing file is replaced.
+        registration: folder of the results of `register`; its refined model is used. By default none:
+            the model as delivered.
+        crs: reference system of the map. By default the UTM zone of the scene, EPSG:4326 in GeoJSON.
+        pixels: "qgis" (x column, y minus row, from the corner of the first pixel), or "corner" or
+            "centre" of the first pixel with y down. By default "qgis".
+        sigma_px: precision of the digitised vertices, one standard deviation of each coordinate, pixels;
+            it enters the predicted accuracy. By default 0.5.
+
+    Raises:
+        InputError: a file cannot be used, or a vertex lies outside the image or meets no ground.
+    """
+    files = _files_of(scene)
+    of_registration = None if registration is None else Path(registration)
+    return correct_file(
+        VectorFile(Path(vectors)),
+        SceneModel(files.image, files.model, of_registration, files.sigma_m),
+        _terrain_file(terrain),
+        Path(output),
+        crs=crs,
+        options=CorrectionOptions(pixels, sigma_px=sigma_px),
+    )
+
+
+def _given_marks(lon_lat_h: ArrayLike, line_sample: ArrayLike) -> CheckPoints:
+    ground, marks = ground_rows(lon_lat_h, "marks"), rows_of(line_sample, "marks", (2,))
+    if len(ground) != len(marks):
+        raise InputError(
+            f"marks: {len(ground)} ground positions and {len(marks)} image positions found, as many of "
+            "both expected"
+        )
+    unknown = np.full((len(marks), 3), np.nan)
+    return CheckPoints(ground, marks, unknown, unknown[:, 0])
+
+
+@dataclass(frozen=True)
+class _Outputs:
+    """Where the results of a registration go, and what they include."""
+
+    folder: Path
+    check_points: FilePath | None
+    copy_image: bool
+
+
+def _registered(
+    scene: Scene | FilePath,
+    sources: ControlSources,
+    outputs: _Outputs,
+    options: RegistrationOptions,
+    progress: Progress,
+) -> Registration:
+    """The registration of a scene whose results are written."""
+    files = _files_of(scene)
+    if outputs.check_points is not None:
+        files = replace(files, check_points=Path(outputs.check_points))
+    with replacing(outputs.folder) as new:
+        copy_image = outputs.copy_image
+        run = run_registration(
+            files, sources, new, options=options, copy_image=copy_image, progress=progress
+        )
+    return run.registration
+
+
+def _refuse_without_folder(check_points: FilePath | None, copy_image: bool) -> None:
+    if check_points is not None or copy_image:
+        raise InputError("check_points, copy_image: a folder for the results is expected with them")
+
+
+def _files_of(scene: Scene | FilePath) -> SceneFiles:
+    return scene.files if isinstance(scene, Scene) else SceneFiles(Path(scene))
+
+
+def _folder_of(block: Block | FilePath) -> Path:
+    return block.folder if isinstance(block, Block) else Path(block)
+
+
+def _terrain_file(terrain: Terrain | FilePath) -> TerrainFile:
+    if isinstance(terrain, Terrain):
+        return terrain.file
+    return TerrainFile(Path(terrain), geoid_option="`geoid`")

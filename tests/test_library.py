@@ -1,0 +1,265 @@
+"""The front door: `import amers`, its names, and the recipes of docs/library.md."""
+
+import ast
+import inspect
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import amers
+from amers.app.usecases.vector_files import CorrectionOptions
+from amers.services.matching.tie_points import MatchOptions
+from amers.services.orthorectification.rectify import OrthoOptions
+from amers.services.production.from_images import ProductionOptions
+from amers.services.registration.options import RegistrationOptions
+from scripts.recipes import LIBRARY, recipes, write_files, write_modules_of_others
+from tests.app.flat_world import CENTRE, GROUND_H, SHIFT_PX, FlatWorld, make_flat_world
+from tests.imports import beyond_budget, imported_by
+
+ROOT = Path(__file__).parent.parent
+RECIPES = recipes()
+TASKS = (
+    "correct_vectors",
+    "locate",
+    "match_images",
+    "open_scene",
+    "open_terrain",
+    "orthorectify",
+    "produce_points",
+    "refine",
+    "register",
+    "register_on_reference",
+    "register_together",
+)
+OPTION = re.compile(r"^ {8}(\w+(?:, \w+)*): (.*?)(?=^ {8}\w+(?:, \w+)*: |\Z)", re.DOTALL | re.MULTILINE)
+"""The line of an option in a docstring, with what follows."""
+
+
+def arguments_of(function: object) -> dict[str, str]:
+    """What a docstring says about each argument."""
+    text = inspect.getdoc(function) or ""
+    section = re.search(r"^Args:\n(.*?)(?=^\w|\Z)", text, re.DOTALL | re.MULTILINE)
+    assert section is not None
+    indented = re.sub("^", "    ", section[1], flags=re.MULTILINE)
+    return {
+        name: " ".join(words.split())
+        for names, words in OPTION.findall(indented)
+        for name in names.split(", ")
+    }
+
+
+def test_the_import_of_amers_loads_nothing():
+    assert beyond_budget(imported_by("import amers"), set()) == {}
+    light = "import amers; amers.InputError; amers.Client"
+    assert set(beyond_budget(imported_by(light), {"importlib.metadata"})) == {"httpx"}
+
+
+def test_the_names_for_type_checkers_are_those_that_are_loaded():
+    tree = ast.parse(Path(amers.__file__).read_text())
+    condition = next(node for node in tree.body if isinstance(node, ast.If))
+    static = {
+        alias.asname: node.module
+        for node in condition.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert static == amers._HOME
+    assert sorted(static) == sorted(amers.__all__)
+    assert set(amers.__all__) <= set(dir(amers))
+    for name in amers.__all__:
+        assert getattr(amers, name).__doc__, name
+
+
+def test_the_page_of_the_library_lists_the_names():
+    table = LIBRARY.read_text().partition("| name |")[2].partition("\n\n")[0]
+    listed = set(re.findall(r"`(\w+)`", table.replace("does |", "")))
+    assert listed == {*amers.__all__, "__version__"}
+
+
+def test_another_name_is_no_attribute():
+    with pytest.raises(AttributeError, match="no_such_task"):
+        _ = amers.no_such_task  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_docstring_gives_the_default_and_the_effect_of_every_option(name: str):
+    described = arguments_of(getattr(amers, name))
+    parameters = inspect.signature(getattr(amers, name)).parameters
+    assert set(described) == set(parameters)
+    for option, parameter in parameters.items():
+        if parameter.default is inspect.Parameter.empty or "defaults" in described[option]:
+            continue
+        words = described[option].partition("By default ")[2]
+        assert words, option
+        if isinstance(parameter.default, str) and parameter.default:
+            assert f'"{parameter.default}"' in words, option
+        elif isinstance(parameter.default, float | int) and not isinstance(parameter.default, bool):
+            assert re.match(rf"{parameter.default:g}\b", words), option
+
+
+def test_defaults_are_those_of_the_science():
+    def default(name: str, option: str) -> object:
+        return inspect.signature(getattr(amers, name)).parameters[option].default
+
+    production, registration = ProductionOptions(), RegistrationOptions()
+    assert default("produce_points", "gsds_m") == production.gsds_m
+    assert default("produce_points", "points") == production.points
+    assert default("register", "max_points") == registration.max_points
+    limit = registration.qualification.max_ce90_on_earth_m
+    assert default("register", "max_ce90_on_earth_m") == limit
+    assert default("match_images", "max_ratio") == MatchOptions().max_ratio
+    assert default("match_images", "tolerance_px") == MatchOptions().tolerance_px
+    assert default("orthorectify", "hide") == OrthoOptions().hide
+    assert default("correct_vectors", "sigma_px") == CorrectionOptions().sigma_px
+    assert default("correct_vectors", "pixels") == CorrectionOptions().pixels
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
+    return make_flat_world(tmp_path_factory.mktemp("world"), size=600, points=4)
+
+
+@pytest.fixture
+def scene(world: FlatWorld) -> amers.Scene:
+    return amers.open_scene(world.tagged)
+
+
+GROUND = [*CENTRE, GROUND_H]
+
+
+def test_one_place_gives_one_answer_and_many_give_many(scene: amers.Scene):
+    one = amers.project(scene, GROUND)
+    many = amers.project(scene, np.array([GROUND, GROUND]))
+    assert (one.shape, many.shape) == ((2,), (2, 2))
+    assert (many == one).all()
+    back = amers.locate(scene, one, GROUND_H)
+    assert back == pytest.approx(GROUND, abs=1e-9)
+    assert amers.locate(scene, many, [GROUND_H, GROUND_H]).shape == (2, 3)
+    assert (amers.project(scene.files.image, GROUND) == one).all()
+    assert (amers.project(str(scene.files.image), GROUND) == one).all()
+
+
+@pytest.mark.parametrize(
+    ("ground", "message"),
+    [
+        ([43.25, 95.0, 0.0], "lon_lat_h: latitude 95 found in row 0"),
+        ([[5.0, 43.0, 0.0], [5.0, -91.0, 0.0]], "latitude -91 found in row 1"),
+        ([500.0, 43.0, 0.0], "longitude 500 found"),
+        ([5.25, 43.25], r"shape \(2,\) found, \(3,\) or \(n, 3\) expected"),
+        (["east", 43.25, 0.0], "numbers expected"),
+    ],
+)
+def test_what_is_no_ground_is_refused_by_name(scene: amers.Scene, ground: list, message: str):
+    with pytest.raises(amers.InputError, match=message):
+        amers.project(scene, ground)
+
+
+def test_a_latitude_is_refused_wherever_ground_is_given(scene: amers.Scene):
+    with pytest.raises(amers.InputError, match="marks: latitude 95"):
+        amers.refine(scene, ([[5.0, 95.0, 0.0]], [[1.0, 1.0]]))
+
+
+def test_either_a_height_or_a_terrain_is_expected(scene: amers.Scene):
+    with pytest.raises(amers.InputError, match="either a height or a terrain"):
+        amers.locate(scene, [10.0, 10.0])
+    with pytest.raises(amers.InputError, match=r"shape \(3,\) found, one height or \(1,\)"):
+        amers.locate(scene, [10.0, 10.0], [1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize("order", ["shift", "drift", "affine"])
+def test_the_fewest_marks_of_an_order_give_the_correction(scene: amers.Scene, order: str):
+    count = {"shift": 2, "drift": 3, "affine": 4}[order]
+    seen = np.array([[90.0, 40.0], [450.0, 560.0], [70.0, 470.0], [500.0, 90.0]])[:count]
+    ground = amers.locate(scene, seen, GROUND_H)
+    moved = seen + [7.0, -3.0]
+    refinement = amers.refine(scene, (ground, moved), order=order)
+    assert amers.project(refinement, ground) == pytest.approx(moved, abs=1e-6)
+    assert str(refinement).startswith(f"Refinement: {order} on {count} of {count} marks")
+
+
+def test_too_few_marks_are_refused_with_their_number(scene: amers.Scene):
+    ground = amers.locate(scene, [[30.0, 40.0]], GROUND_H)
+    with pytest.raises(amers.ComputationError, match="1 usable points found, 3 needed"):
+        amers.refine(scene, (ground, [[30.0, 40.0]]), order="drift")
+    with pytest.raises(amers.InputError, match="as many of both"):
+        amers.refine(scene, (ground, [[30.0, 40.0], [1.0, 1.0]]))
+    with pytest.raises(amers.InputError, match="one of shift, drift, affine expected"):
+        amers.refine(scene, (ground, [[30.0, 40.0]]), order="cubic")  # type: ignore[arg-type]
+
+
+def test_the_correction_of_marks_is_that_which_was_put_in(world: FlatWorld):
+    """The model of the flat world is off by a known shift; marks of half a pixel find it."""
+    rng = np.random.default_rng(3)
+    seen = rng.uniform(20.0, 580.0, (30, 2))
+    ground = world.true_model.locate(seen, np.full(30, GROUND_H))
+    refinement = amers.refine(world.tagged, (ground, seen + rng.normal(0.0, 0.5, (30, 2))))
+    left = amers.project(refinement, ground) - seen
+    predicted = refinement.adjustment.covariance_at(seen)
+    normalised = np.einsum("ni,nij,nj->n", left, np.linalg.inv(predicted), left)
+    assert np.abs(left).max() < 1.0
+    assert normalised.mean() < 6.0
+    assert np.median(amers.project(world.tagged, ground) - seen, axis=0) == pytest.approx(
+        -SHIFT_PX, abs=1e-6
+    )
+
+
+def test_results_need_a_folder_for_what_only_files_have(tmp_path: Path):
+    for option in ({"check_points": "points.csv"}, {"copy_image": True}):
+        with pytest.raises(amers.InputError, match="a folder for the results is expected"):
+            amers.register("scene.tif", "block", **option)
+        with pytest.raises(amers.InputError, match="a folder for the results is expected"):
+            amers.register_on_reference("scene.tif", "ortho.tif", None, **option)
+
+
+def test_scenes_of_one_name_are_refused_before_any_work():
+    for names in (["a/scene.tif", "b/scene.tif"], ["block.tif"]):
+        with pytest.raises(amers.InputError, match="images with different names expected"):
+            amers.register_together(names, "block", "together")
+
+
+def test_there_are_twelve_recipes_of_some_ten_lines():
+    assert len(RECIPES) == 12 + len(["Errors"])
+    assert [name for name, program in RECIPES.items() if len(program.splitlines()) > 10] == []
+
+
+@pytest.fixture(scope="module")
+def recipe_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The files that recipes name, beside modules of others."""
+    folder = tmp_path_factory.mktemp("recipes")
+    write_files(folder)
+    write_modules_of_others(folder)
+    return folder
+
+
+@pytest.mark.long
+@pytest.mark.thorough
+def test_a_recipe_runs_as_it_stands(recipe_folder: Path):
+    """Each in a process of its own, which Python starts in the folder with the modules of others."""
+    for name, program in RECIPES.items():
+        (recipe_folder / "recipe.py").write_text(program)
+        done = subprocess.run(
+            [sys.executable, "recipe.py"],
+            cwd=recipe_folder,
+            env={**os.environ, "PYTHONPATH": ""},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, name + done.stderr
+        check_output(name, done.stdout)
+
+
+def check_output(name: str, printed: str) -> None:
+    """What a recipe prints: objects in three lines, and results near the truth."""
+    first = printed.splitlines()[0] if printed else ""
+    if name == "Register a scene":
+        assert first.startswith("Registration: good"), printed
+    if name == "Register a scene on a reference image":
+        assert first.startswith(("Registration: good", "Registration: usable")), printed
+    for line in printed.splitlines():
+        assert len(line) < 200
