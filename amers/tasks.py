@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from amers.app.usecases.executors import ComputeOptions
-from amers.app.usecases.image_production import ProductionImages, WorkPlace, run_production
+from amers.app.usecases.image_production import ProductionImages, WorkPlace, run_image_production
+from amers.app.usecases.new_block import BlockIdentity
 from amers.app.usecases.orthorectification import OrthoMap, Orthorectified, run_orthorectification
-from amers.app.usecases.production import BlockIdentity
 from amers.app.usecases.registered_scene import SceneModel
 from amers.app.usecases.registration.control_sources import points_of_block
 from amers.app.usecases.registration.on_marks import Refinement, read_marks, refine_on_marks, written
@@ -49,7 +49,7 @@ from amers.services.errors import AmersError, InputError
 from amers.services.formats.vector.pixel_coordinates import PixelOrigin
 from amers.services.misfit.affine_fit import Order
 from amers.services.orthorectification.rectify import OrthoOptions
-from amers.services.production.from_images import ProductionOptions
+from amers.services.production.image_production import ProductionOptions
 from amers.services.quality.check_points import MARKING_SIGMA_PX, CheckPoints
 from amers.services.quality.qualification import QualificationOptions
 from amers.services.registration.on_points import Registration, register_scene
@@ -295,7 +295,7 @@ def produce_points(
         ComputationError: the images do not make a block.
     """
     new = Path(folder)
-    run_production(
+    run_image_production(
         ProductionImages(tuple(map(Path, images)), sigma_m=sigma_m),
         new,
         BlockIdentity(new.name, license=licence),

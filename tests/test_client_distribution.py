@@ -1,4 +1,4 @@
-"""The distribution of the client alone: the files of app/client, which need httpx and nothing of Amers."""
+"""The distribution of the client alone: the files of app/client, which need httpx alone."""
 
 import ast
 import sys

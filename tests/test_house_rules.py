@@ -25,7 +25,7 @@ ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
 OPERATIONS = ROOT / "docs" / "operations.md"
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("*/README.md")])
-FOLDERS = "app|services|migrations|tests|docs|examples|benchmarks|scripts|web|qgis_plugin"
+FOLDERS = "amers|client|app|services|migrations|tests|docs|examples|benchmarks|scripts|web|qgis_plugin"
 OLD_WORDS = (
     r"\bdoors?\b",
     r"homologous",

@@ -1,4 +1,4 @@
-"""The front door: `import amers`, its names, and the recipes of docs/library.md."""
+"""The names that `import amers` gives, and the recipes of docs/library.md."""
 
 import ast
 import inspect
@@ -15,7 +15,7 @@ import amers
 from amers.app.usecases.vector_files import CorrectionOptions
 from amers.services.matching.tie_points import MatchOptions
 from amers.services.orthorectification.rectify import OrthoOptions
-from amers.services.production.from_images import ProductionOptions
+from amers.services.production.image_production import ProductionOptions
 from amers.services.registration.options import RegistrationOptions
 from scripts.recipes import LIBRARY, recipes, write_files, write_modules_of_others
 from tests.app.flat_world import CENTRE, GROUND_H, SHIFT_PX, FlatWorld, make_flat_world
