@@ -150,8 +150,8 @@ print(points[["saliency", "n_views", "geometry"]])
     Recipe(
         "Python client of Amers",
         "Points and blocks, uploads, registrations and their results; it asks for page after page by "
-        "itself. It comes with Amers. Where Amers is not installed, the package amers-client has it alone, "
-        "with httpx: write `from amers_client import Client`.",
+        "itself. It comes with Amers. Where Amers is not installed, the package amers-client has it "
+        "alone, with httpx: write `from amers_client import Client`.",
         (
             Lines(
                 "python",

@@ -77,7 +77,8 @@ class CorrectedFile:
     def __repr__(self) -> str:
         relative, on_the_earth = self.relative_to_control_points, self.on_the_earth
         return (
-            f"CorrectedFile {self.path}: {self.features} features, {self.vertices} vertices, {self.crs}\n"
+            f"CorrectedFile {self.path}: {self.crs}, {self.features} features with {self.vertices} "
+            f"vertices\n"
             f"  {relative.label}: {relative.words}\n"
             f"  {on_the_earth.label}: {on_the_earth.words}"
         )
