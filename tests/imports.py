@@ -10,7 +10,7 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 PACKAGES = frozenset(
     """
-    alembic cql2 cv2 fastapi geoalchemy2 httpx importlib.metadata jinja2 matplotlib numba numpy obstore
+    alembic cv2 fastapi geoalchemy2 httpx importlib.metadata jinja2 matplotlib numba numpy obstore
     pandas procrastinate prometheus_client psycopg pyarrow pydantic_settings pyogrio pyproj rasterio
     scipy scipy.spatial scipy.stats shapely sqlalchemy uvicorn
     """.split()  # noqa: SIM905

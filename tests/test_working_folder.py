@@ -9,7 +9,6 @@ import pytest
 
 from amers.app.child_processes import SAFE_PATH, leave_out_working_folder
 from amers.app.cli.supervisor import Child
-from amers.app.db.features import cql2_process
 from amers.app.usecases.executors import ComputeOptions, open_executor
 from amers.app.worker.warm_process import WarmServer
 from tests.hostile_folder import executed, fill_with_modules
@@ -51,12 +50,6 @@ def test_a_warm_process_leaves_the_working_folder_out(marker: Path) -> None:
 def test_processes_of_a_pool_leave_the_working_folder_out(marker: Path) -> None:
     with open_executor(ComputeOptions(jobs=2)) as (pool, _):
         assert [pool.submit(abs, -number).result() for number in range(3)] == [0, 1, 2]
-    assert executed(marker) == []
-
-
-def test_the_parser_of_filters_leaves_the_working_folder_out(marker: Path) -> None:
-    cql2_process._start_afresh()
-    assert cql2_process.parse("text", "a = 1")["op"] == "="
     assert executed(marker) == []
 
 

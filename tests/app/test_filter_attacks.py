@@ -30,7 +30,7 @@ LARGEST = {
     "a sum": "saliency = " + "1+" * 31 + "1",
     "minus signs": "saliency = " + "-" * 31 + "1",
     "not": "not " * 31 + "saliency = 1",
-    "parentheses": "(" * 10 + "saliency > 1" + ")" * 10,
+    "parentheses": "(" * 16 + "saliency > 1" + ")" * 16,
     "positions": "s_intersects(geometry, GEOMETRYCOLLECTION(" + ",".join(["POINT(1 2)"] * 355) + "))",
     "functions": "casei(" * 16 + "typology" + ")" * 16 + " = 'a'",
 }

@@ -1,22 +1,15 @@
-"""Filters within bounds, read as the library reads them, and parsed where nothing else can be harmed."""
+"""Filters within bounds, in both languages, and their geometries."""
 
 import json
 import math
-import signal
-import subprocess
-import sys
-import threading
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 import shapely
 
-from amers.app.db.features import cql2_process
 from amers.app.db.features.cql2 import translate
-from amers.app.db.features.cql2_bounds import parse_geometry, parse_json, parse_text
-from amers.app.db.features.cql2_tokens import LONGEST_TEXT, check_text
+from amers.app.db.features.cql2_bounds import parse_geometry, parse_json
+from amers.app.db.features.cql2_text import LONGEST_TEXT, parse_text
 from amers.app.db.features.crs import CRS84, EPSG_3857, EVERY
 from amers.app.db.points import POINTS
 from amers.app.errors import InvalidParameter
@@ -24,8 +17,7 @@ from tests.app.filter_attacks import NAMED
 
 pytestmark = pytest.mark.security
 
-OVERFLOW = "-" * 3900 + "1"
-ENDLESS = "(" * 40 + "1" + ",2)" * 40
+WITHIN = '{"op": "s_within", "args": [{"property": "geometry"}, %s]}'
 
 
 @pytest.mark.parametrize("text", NAMED.values(), ids=NAMED.keys())
@@ -55,12 +47,10 @@ def test_an_attack_is_refused(text: str) -> None:
     ],
 )
 def test_a_filter_of_the_standard_passes(text: str) -> None:
-    check_text(text)
     assert parse_text(text)
 
 
-def test_the_largest_filters_of_each_kind_end_no_process() -> None:
-    pids = _pids()
+def test_the_largest_filters_of_each_kind_are_answered() -> None:
     for text in (
         "saliency in (" + "1," * 990 + "1)",
         "1 or " * 799 + "1",
@@ -72,89 +62,6 @@ def test_the_largest_filters_of_each_kind_end_no_process() -> None:
     ):
         assert len(text) <= LONGEST_TEXT
         _answer(text)
-    assert _pids() == pids
-
-
-def test_a_filter_that_ends_its_parser_is_refused_and_the_next_one_answered() -> None:
-    with pytest.raises(InvalidParameter, match="cannot be parsed"):
-        cql2_process.parse("text", OVERFLOW)
-    assert cql2_process.parse("text", "a = 1") == {"op": "=", "args": [{"property": "a"}, 1.0]}
-
-
-@pytest.mark.thorough
-def test_a_filter_that_never_ends_is_refused_while_others_are_answered() -> None:
-    refusals: list[str] = []
-
-    def hang() -> None:
-        with pytest.raises(InvalidParameter) as error:
-            cql2_process.parse("text", ENDLESS)
-        refusals.append(str(error.value))
-
-    thread = threading.Thread(target=hang)
-    thread.start()
-    time.sleep(0.2)
-    answers = 0
-    while thread.is_alive() and answers < 5:
-        assert cql2_process.parse("text", "true") is True
-        answers += 1
-    assert not refusals, "the others have not waited for the endless one"
-    thread.join()
-    assert answers == 5
-    assert "more than 1 s" in refusals[0]
-
-
-def test_a_parser_has_no_file_no_secret_and_little_memory_of_the_service() -> None:
-    cql2_process.parse("text", "true")
-    (pid, *_) = _pids()
-    assert {link.name for link in Path(f"/proc/{pid}/fd").iterdir()} == {"0", "1", "2"}
-    assert Path(f"/proc/{pid}/environ").read_bytes() == b""
-    limits = Path(f"/proc/{pid}/limits").read_text()
-    assert str(256 << 20) in next(line for line in limits.splitlines() if "address space" in line)
-
-
-ORPHANS = """
-import os, signal, sys, threading, time
-from amers.app.db.features import cql2_process
-cql2_process.parse("text", "true")
-threading.Thread(target=cql2_process.parse, args=("text", sys.argv[1]), daemon=True).start()
-time.sleep(0.3)
-cql2_process.parse("text", "true")
-processes = [entry.process for entry in cql2_process._processes]
-print(*(process.pid for process in processes if process), flush=True)
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-@pytest.mark.thorough
-def test_parsers_end_when_the_process_that_started_them_is_killed() -> None:
-    run = subprocess.run([sys.executable, "-c", ORPHANS, ENDLESS], capture_output=True, text=True)
-    assert run.returncode == -signal.SIGKILL, run.stderr
-    pids = run.stdout.split()
-    assert len(pids) == 2
-    deadline = time.monotonic() + 30
-    while any(_is_parser(pid) for pid in pids):
-        assert time.monotonic() < deadline, "one of them lives on"
-        time.sleep(0.1)
-
-
-FORKED = """
-import os
-from amers.app.db.features import cql2_process
-def pids():
-    cql2_process.parse("text", "true")
-    return {entry.process.pid for entry in cql2_process._processes if entry.process}
-before = pids()
-child = os.fork()
-if child == 0:
-    os._exit(bool(pids() & before))
-assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0, "shared with the parent"
-assert pids() == before
-"""
-
-
-def test_a_forked_process_has_parsers_of_its_own() -> None:
-    run = subprocess.run([sys.executable, "-c", FORKED], capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
 
 
 @pytest.mark.parametrize(
@@ -170,6 +77,11 @@ def test_a_forked_process_has_parsers_of_its_own() -> None:
         ("[" * 100_000, "JSON"),
         ('{"op": "in", "args": [{"property": "saliency"}, [' + "1," * 15_000 + "1]]}", "more than"),
         ('"true"', "filter"),
+        ('{"op": "=", "args": [{"property": "saliency", "date": "2020-01-01"}, 1]}', "one member of"),
+        ('{"op": "isNull", "args": [{"op": ["x"], "property": "saliency"}]}', "one member of"),
+        (WITHIN % '{"type": "Feature", "geometry": {"type": "Point", "coordinates": [1, 2]}}', "type"),
+        (WITHIN % '{"type": ["Point"], "coordinates": [1, 2]}', "type"),
+        (WITHIN % ('{"bbox": [1, 2, 3, 1' + "0" * 400 + "]}"), "filter"),
     ],
 )
 def test_a_json_filter_that_cannot_be_used_is_refused(text: str, reason: str) -> None:
@@ -181,6 +93,13 @@ def test_a_json_filter_that_cannot_be_used_is_refused(text: str, reason: str) ->
 def test_a_document_with_a_value_that_json_does_not_have_is_refused(value: object) -> None:
     with pytest.raises(InvalidParameter, match=r"^filter: "):
         parse_json({"op": "=", "args": [{"property": "saliency"}, value]})
+
+
+def test_a_geometry_that_states_its_extent_is_no_box() -> None:
+    point = {"type": "Point", "bbox": [1.0, 2.0, 3.0, 4.0], "coordinates": [2.0, 3.0]}
+    document = {"op": "s_within", "args": [{"property": "geometry"}, point]}
+    assert parse_json(document) == document
+    assert shapely.from_wkb(parse_geometry(point, CRS84, "filter")).equals(shapely.Point(2.0, 3.0))
 
 
 def as_mercator(lon_lat: list[tuple[float, float]]) -> dict[str, object]:
@@ -226,17 +145,3 @@ def _answer(text: str) -> None:
         translate(parse_text(text), POINTS, CRS84)
     except InvalidParameter:
         return
-
-
-def _pids() -> set[int]:
-    """The processes that parse for this one, both of them started."""
-    for entry in cql2_process._processes:
-        entry.parse("text", "true")
-    return {entry.process.pid for entry in cql2_process._processes if entry.process}
-
-
-def _is_parser(pid: str) -> bool:
-    try:
-        return b"cql2_parser" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    except OSError:
-        return False

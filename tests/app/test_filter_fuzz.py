@@ -11,7 +11,7 @@ pytestmark = pytest.mark.security
 COUNTS = {"bounded": 3_000, "full": 50_000}
 SEED = 20_261_122
 LONGEST_S = 5.0
-"""Time for one filter on a busy machine; its parser has 2 s of CPU at most."""
+"""Time for one filter on a busy machine."""
 
 
 @pytest.mark.long
@@ -32,5 +32,4 @@ def test_random_filters_are_accepted_or_refused_and_nothing_else(request: pytest
         for kind in ("accepted", "refused")
         for language in ("text", "json")
     )
-    assert figures["parsers_lost"] == 0, "a filter passed the bounds and ended its parser"
     assert figures["slowest_s"] < LONGEST_S, figures["slowest"]

@@ -7,8 +7,8 @@ never used: it lets any function name through.
 """
 
 import json
-import math
 import operator
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -32,7 +32,8 @@ from sqlalchemy import (
 
 from amers.app.db.constants import integer_constant
 from amers.app.db.features.collection import Collection, Property
-from amers.app.db.features.cql2_bounds import MOST_NODES, parse_geometry, parse_text
+from amers.app.db.features.cql2_bounds import MOST_NODES, parse_geometry
+from amers.app.db.features.cql2_text import parse_text
 from amers.app.db.features.crs import CRS84, Crs
 from amers.app.db.features.instants import Moment, Time, parse_moment
 from amers.app.db.features.predicates import Condition, geometry_from_wkb
@@ -43,6 +44,7 @@ GEOMETRY = ("geometry", "geom")
 KEPT_FILTERS = 32
 DEEPEST_EXPRESSION = 32
 """Operators in each other. SQLAlchemy compiles them recursively, with a dozen calls for each."""
+LARGEST_NUMBER = sys.float_info.max
 
 Expression = ColumnElement[Any]
 Predicate = ColumnElement[bool]
@@ -61,6 +63,7 @@ def _remainder(left: Expression, right: Expression) -> Expression:
 COMPARISONS: Mapping[str, Callable[[Any, Any], Predicate]] = {
     "=": operator.eq,
     "<>": operator.ne,
+    "!=": operator.ne,
     "<": operator.lt,
     "<=": operator.le,
     ">": operator.gt,
@@ -307,8 +310,9 @@ class _Translator:
         return value
 
     def _number(self, node: int | float) -> _Value:
-        if not math.isfinite(node):
-            raise InvalidParameter(f"filter: {node} is not a number to compare with")
+        # A whole number of JSON may have any number of digits.
+        if not abs(node) <= LARGEST_NUMBER:
+            raise InvalidParameter(f"filter: a number below {LARGEST_NUMBER:.1e} expected")
         # Whole numbers stay whole, so that the index of the key serves them.
         if float(node).is_integer() and abs(node) < 2**53:
             return _Value(literal(int(node), BigInteger()), "number", literal=node)
@@ -319,14 +323,15 @@ class _Translator:
         if not isinstance(op, str) or not isinstance(args, list):
             raise InvalidParameter(f"filter: a value expected, {json.dumps(node)!s:.60} found")
         self._add_nodes(1)
-        if op.lower() == "casei":
+        op = op.lower()
+        if op == "casei":
             _count(op, args, 1)
             inner = self._scalar(args[0])
             if inner.kind != "text":
                 raise InvalidParameter("filter: casei: a text expected")
             return _Value(func.lower(inner.expression, type_=Text()), "text", literal=inner.literal)
         if op not in ARITHMETIC:
-            raise InvalidParameter(f"filter: no operator or function {op!r:.60} here")
+            raise InvalidParameter(f"filter: no operator or function {node['op']!r:.60} here")
         if op == "-" and len(args) == 1:
             args = [0, *args]
         _count(op, args, 2)

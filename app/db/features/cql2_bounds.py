@@ -1,4 +1,4 @@
-"""Parsing of filters within limits of size: CQL2 in both languages, geometries.
+"""Limits of filters: CQL2 JSON and geometries that are not too large, too deep or no JSON.
 
 Sources: OGC 21-065r2, Common Query Language (CQL2); RFC 7946.
 """
@@ -9,61 +9,48 @@ from typing import Any
 import shapely
 
 from amers.app.db.features.antimeridian import on_the_map
-from amers.app.db.features.cql2_process import parse
-from amers.app.db.features.cql2_tokens import check_text, check_times
 from amers.app.db.features.crs import Crs, lon_lat_from_mercator
-from amers.app.db.features.instants import parse_moment
 from amers.app.errors import InvalidParameter
 
 LONGEST_JSON = 2_000_000
 """Characters of a filter in JSON."""
 DEEPEST_JSON = 32
-DEEPEST_PARSED = 100
-"""Levels of a filter in text as JSON, two for each operator."""
 MOST_NODES = 1_000
 MOST_VERTICES = 10_000
-
-
-def parse_text(text: str) -> Any:
-    """The CQL2 JSON of a filter in CQL2 text.
-
-    Raises:
-        InvalidParameter: the text is not CQL2, too long or too deep.
-    """
-    _check_unicode(text)
-    check_text(text)
-    check_times(text)
-    document = parse("text", text)
-    check_size(document, "filter", DEEPEST_PARSED)
-    return document
+KINDS = ("op", "property", "date", "timestamp", "interval", "type", "bbox")
+"""Members of which each object of CQL2 JSON has one: it says what the object is."""
+GEOMETRY_TYPES = (
+    *("Point", "LineString", "Polygon", "MultiPoint", "MultiLineString", "MultiPolygon"),
+    "GeometryCollection",
+)
 
 
 def parse_json(document: Any) -> Any:
-    """A filter in CQL2 JSON, checked by the library.
+    """A filter in CQL2 JSON within limits; `translate` checks what it means.
 
     Args:
         document: parsed, or its text.
 
     Raises:
-        InvalidParameter: the document is not CQL2, too large or too deep, or has a number that is not
+        InvalidParameter: the document is not JSON, too large or too deep, or has a number that is not
             finite, a member twice or half a character.
     """
     if isinstance(document, str):
         document = _loaded(document)
     check_size(document, "filter")
-    _check_times(document)
+    _check_kinds(document)
     try:
         text = json.dumps(document, ensure_ascii=False, allow_nan=False)
     except ValueError:
         raise InvalidParameter("filter: NaN or an infinity found, a finite number expected") from None
-    _check_unicode(text)
+    check_unicode(text)
     if len(text) > LONGEST_JSON:
         raise InvalidParameter(f"filter: {len(text)} characters of JSON, {LONGEST_JSON} at most")
-    return parse("json", text)
+    return document
 
 
-def _check_times(document: Any) -> None:
-    """As `check_times` of text, for a document that `check_size` has let through."""
+def _check_kinds(document: Any) -> None:
+    """Raise an error for an object that could be read in several ways, or as no geometry."""
     parts = [document]
     while parts:
         part = parts.pop()
@@ -71,12 +58,13 @@ def _check_times(document: Any) -> None:
             parts += part
         elif isinstance(part, dict):
             parts += part.values()
-            ends = part.get("interval")
-            texts = [end for end in ends if isinstance(end, str)] if isinstance(ends, list) else []
-            texts += [part[name] for name in ("date", "timestamp") if name in part]
-            for text in texts:
-                if text != "..":
-                    parse_moment(text, "filter")
+            # A geometry may state its extent.
+            kinds = [kind for kind in KINDS if kind in part and not (kind == "bbox" and "type" in part)]
+            if len(kinds) != 1 or part.get("type", "Point") not in GEOMETRY_TYPES:
+                raise InvalidParameter(
+                    f"filter: {json.dumps(part)!s:.60} found, an object with one member of"
+                    f" {', '.join(KINDS)} expected, and the type of a geometry as `type`"
+                )
 
 
 def _loaded(text: str) -> Any:
@@ -97,7 +85,8 @@ def _refuse_constant(name: str) -> Any:
     raise ValueError(f"{name} found, a finite number expected")
 
 
-def _check_unicode(text: str) -> None:
+def check_unicode(text: str) -> None:
+    """Raise an error for half a character, which neither a statement nor a reply can carry."""
     try:
         text.encode()
     except UnicodeEncodeError as error:
@@ -145,8 +134,9 @@ def parse_geometry(node: Any, crs: Crs, where: str) -> bytes:
     if not isinstance(node, dict):
         raise InvalidParameter(f"{where}: a geometry expected, {json.dumps(node)!s:.60} found")
     try:
-        shape = _box(node["bbox"]) if "bbox" in node else shapely.from_geojson(json.dumps(node))
-    except (shapely.errors.ShapelyError, TypeError, ValueError) as error:
+        is_box = "bbox" in node and "type" not in node
+        shape = _box(node["bbox"]) if is_box else shapely.from_geojson(json.dumps(node))
+    except (shapely.errors.ShapelyError, ArithmeticError, TypeError, ValueError) as error:
         raise InvalidParameter(f"{where}: not a GeoJSON geometry: {error!s:.200}") from None
     shape = shapely.force_2d(shape)
     if crs.lat_first:

@@ -201,7 +201,7 @@ def test_req_cql2_spatial_functions(ids, made, text, inside):
         "s_within(geometry, POLYGON((0 0, 1 1, 1 0, 0 1, 0 0)))",
         "saliency = 1 and",
         "((((",
-        "(" * 11 + "id = 1" + ")" * 11,
+        "(" * 17 + "id = 1" + ")" * 17,
         "not " * 2000 + "id = 1",
         "typology like 'x\\'",
         "saliency > 1e300",
