@@ -16,7 +16,7 @@ PYTEST := $(BIN)/python -m pytest -p no:schemathesis --dist loadfile --no-loadsc
 APART := not endurance and not qgis
 LONG := cape_verde continent distorted faults image_selection load stress throughput block_adjustment toutin
 
-.PHONY: demo test test-thorough test-files test-operations test-shuffled test-fast test-security test-endurance test-qgis check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput mutants postgis page chromium proxies pictures plugin
+.PHONY: demo test test-thorough test-files test-operations test-shuffled test-fast test-security test-endurance test-qgis check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput mutants postgis page chromium proxies pictures plugin release
 
 demo: postgis
 	$(BIN)/amers demo
@@ -71,6 +71,12 @@ test-qgis: postgis
 # The QGIS plugin, as QGIS installs it.
 plugin: $(READY)
 	$(BIN)/python -m scripts.make_plugin build/amers-qgis.zip
+
+# Wheel, sources, the client alone and the plugin, each tried in an environment of its own outside the checkout.
+release: postgis page
+	rm -rf dist
+	$(BIN)/python -m scripts.make_release dist
+	$(BIN)/python -m scripts.check_release dist
 
 # Small faults, one at a time: MODULE=services/quality takes minutes, without a module all take hours.
 # What was broken off goes on; SAMPLE=200 tries more of each module.
