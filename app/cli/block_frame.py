@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from amers.app.cli import control_options
+from amers.app.cli.control_options import ControlOptions
 from amers.app.cli.output import AsJson, Row, show_one
 from amers.app.cli.production_rows import accuracy_row
 from amers.app.cli.progress import shown_progress
@@ -27,22 +27,7 @@ def frame(
     version: Annotated[
         str, typer.Option(help="Version of the moved block; by default the next whole number.")
     ] = "",
-    control: control_options.Control = None,
-    control_sigma_m: control_options.SigmaM = None,
-    control_frame_sigma_m: control_options.FrameSigmaM = None,
-    control_mark_sigma_px: control_options.MarkSigmaPx = None,
-    control_vertical: control_options.Vertical = None,
-    control_geoid: control_options.Geoid = None,
-    control_crs: control_options.Crs = None,
-    control_columns: control_options.Columns = None,
-    control_sigma_axes: control_options.SigmaAxes = None,
-    control_ortho: control_options.Ortho = None,
-    control_ortho_sigma_m: control_options.OrthoSigmaM = None,
-    control_dem: control_options.Dem = None,
-    control_dem_vertical: control_options.DemVertical = None,
-    control_dem_geoid: control_options.DemGeoid = None,
-    control_dem_sigma_m: control_options.DemSigmaM = None,
-    control_dem_frame_sigma_m: control_options.DemFrameSigmaM = None,
+    options: ControlOptions,
     check: Annotated[
         list[Path] | None,
         typer.Option(
@@ -58,33 +43,16 @@ def frame(
     The frame on the Earth is estimated again, with its covariance. Nothing is stored: `amers block
     ingest` stages the new folder.
     """
-    control_files = control_options.control_files(
-        control=control,
-        sigma_m=control_sigma_m,
-        frame_sigma_m=control_frame_sigma_m,
-        mark_sigma_px=control_mark_sigma_px,
-        vertical=control_vertical,
-        geoid=control_geoid,
-        crs=control_crs,
-        columns=control_columns,
-        sigma_axes=control_sigma_axes,
-        ortho=control_ortho,
-        ortho_sigma_m=control_ortho_sigma_m,
-        dem=control_dem,
-        dem_vertical=control_dem_vertical,
-        dem_geoid=control_dem_geoid,
-        dem_sigma_m=control_dem_sigma_m,
-        dem_frame_sigma_m=control_dem_frame_sigma_m,
-    )
-    if not (control or control_ortho or control_dem):
+    control = options.files()
+    if not (control.paths or control.orthos or control.heights):
         raise InputError("no control given: add --control, --control-ortho or --control-dem")
     with shown_progress() as progress:
         placed = place_block(
             block,
             images,
-            control_files,
+            control,
             output,
-            check=None if not check else ControlFiles(tuple(check), control_files.points),
+            check=None if not check else ControlFiles(tuple(check), control.points),
             version=version,
             progress=progress,
         )

@@ -1,5 +1,6 @@
 """`amers block quality`: the quality of a block of the store, or of a folder, against references."""
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -7,8 +8,10 @@ import typer
 from rich.console import Console
 
 from amers.app.cli.exit_status import NO_RESULT
+from amers.app.cli.options import FromMilli, Shown
 from amers.app.cli.output import AsJson, Row, print_json, show_one
 from amers.app.cli.progress import shown_progress
+from amers.app.cli.terrain_options import TerrainOptions
 from amers.app.cli.transaction import transaction
 from amers.app.config import read_settings
 from amers.app.db.engine import opened
@@ -24,7 +27,6 @@ from amers.app.usecases.blocks.quality import (
     write_quality,
 )
 from amers.app.usecases.blocks.stored_quality import assess_stored
-from amers.app.usecases.terrain_file import TerrainFile
 from amers.services.formats.block.document_json import BLOCK_JSON
 from amers.services.quality.accuracy_statement import accuracy_document
 from amers.services.quality.block import BlockQuality, Distribution, quality_document
@@ -33,7 +35,67 @@ from amers.services.reports.block_quality_pages import quality_tables
 from amers.services.reports.document import report_document
 
 _TABLE_WIDTH = 110
+
+
 _Files = list[Path] | None
+References = Annotated[
+    QualityReferences,
+    Shown(
+        site_sigma_m=typer.Option(min=0.001),
+        reach_m=typer.Option("--search-m", min=0.01),
+        images=None,
+        excluded=typer.Option("--exclude", exists=True),
+    ),
+]
+Required = Annotated[
+    RequiredQuality,
+    Shown(
+        points_per_km2=typer.Option(min=1e-6),
+        min_views=typer.Option(min=1),
+        ce90_m=typer.Option(min=0.001),
+        le90_m=typer.Option(min=0.001),
+    ),
+]
+
+
+@dataclass(frozen=True)
+class HeightOptions(TerrainOptions):
+    """Heights that those of a block are compared with.
+
+    Attributes:
+        dem: GeoTIFF with heights to compare with.
+        vertical: vertical datum of --dem: ellipsoid, EGM96, EGM2008, EPSG:…
+        dem_sigma_m: sigma of these heights, metres; by default 0.1 of their step.
+        dem_frame_sigma_m: sigma of the error that all of them share, metres.
+        exclude_heights: ground where --dem is not to be trusted; the same; repeat.
+        land_cover: image of land cover classes, to tell heights apart.
+    """
+
+    dem_sigma_m: FromMilli = None
+    dem_frame_sigma_m: FromMilli = None
+    exclude_heights: tuple[Path, ...] = ()
+    land_cover: Path | None = None
+
+    def files(self) -> HeightFiles | None:
+        """The heights; None without --dem.
+
+        Raises:
+            InputError: something is stated of heights that are not given.
+        """
+        if self.terrain is not None:
+            return HeightFiles(
+                self.terrain,
+                self.dem_sigma_m,
+                self.dem_frame_sigma_m,
+                self.exclude_heights,
+                self.land_cover,
+            )
+        if self.exclude_heights or self.land_cover or self.vertical or self.geoid:
+            raise InputError(
+                "--exclude-heights, --land-cover, --vertical, --geoid: of the heights of --dem, which "
+                "is missing; add it"
+            )
+        return None
 
 
 def quality(
@@ -51,68 +113,13 @@ def quality(
             exists=True, help="The same of a place that the production used as control; repeat."
         ),
     ] = None,
-    site_sigma_m: Annotated[
-        float | None,
-        typer.Option(help="Accuracy of these images, one sigma a coordinate, metres.", min=0.001),
-    ] = None,
-    search_m: Annotated[
-        float | None,
-        typer.Option(
-            help="Largest shift searched at sites; by default 3 sigma of what is declared.", min=0.01
-        ),
-    ] = None,
-    images: Annotated[
-        _Files,
-        typer.Option(
-            exists=True, help="Image of the block (folders only), to be compared with the sites; repeat."
-        ),
-    ] = None,
-    dem: Annotated[
-        Path | None, typer.Option(exists=True, help="GeoTIFF with heights to compare with.")
-    ] = None,
-    vertical: Annotated[
-        str | None, typer.Option(help="Vertical datum of --dem: ellipsoid, EGM96, EGM2008, EPSG:…")
-    ] = None,
-    geoid: Annotated[
-        Path | None, typer.Option(exists=True, help="Grid file of the geoid, GTX or GeoTIFF.")
-    ] = None,
-    dem_sigma_m: Annotated[
-        float | None,
-        typer.Option(help="Sigma of these heights, metres; by default 0.1 of their step.", min=0.001),
-    ] = None,
-    dem_frame_sigma_m: Annotated[
-        float | None, typer.Option(help="Sigma of the error that all of them share, metres.", min=0.001)
-    ] = None,
-    exclude: Annotated[
-        _Files,
-        typer.Option(
-            exists=True,
-            help="Ground without points, such as water: GeoJSON, or image other than 0; repeat.",
-        ),
-    ] = None,
-    exclude_heights: Annotated[
-        _Files,
-        typer.Option(exists=True, help="Ground where --dem is not to be trusted; the same; repeat."),
-    ] = None,
-    land_cover: Annotated[
-        Path | None,
-        typer.Option(exists=True, help="Image of land cover classes, to tell heights apart."),
-    ] = None,
-    points_per_km2: Annotated[
-        float | None, typer.Option(help="Required density; by default that of the block.", min=1e-6)
-    ] = None,
+    references: References,
+    heights: HeightOptions,
+    required: Required,
     min_share: Annotated[
-        float, typer.Option(help="Ground that shall have it, percent.", min=0.0, max=100.0)
+        float,
+        typer.Option(help="Ground that shall have the required density, percent.", min=0.0, max=100.0),
     ] = 100.0 * RequiredQuality.min_share,
-    min_views: Annotated[
-        int | None, typer.Option(help="Required images of a point; by default as specified.", min=1)
-    ] = None,
-    ce90_m: Annotated[
-        float | None, typer.Option(help="Required CE90 on the Earth, metres.", min=0.001)
-    ] = None,
-    le90_m: Annotated[
-        float | None, typer.Option(help="Required LE90 on the Earth, metres.", min=0.001)
-    ] = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Folder of the report, JSON and HTML.")
     ] = None,
@@ -123,41 +130,15 @@ def quality(
     A stored block without any option shows the figures kept since its ingestion. Exit status 3: the
     block misses its specification.
     """
-    references = QualityReferences(
-        heights=None
-        if dem is None
-        else HeightFiles(
-            TerrainFile(dem, vertical, geoid),
-            dem_sigma_m,
-            dem_frame_sigma_m,
-            tuple(exclude_heights or ()),
-            land_cover,
-        ),
-        sites=(
-            *(SiteFile(path) for path in site or ()),
-            *(SiteFile(path, is_control=True) for path in control_site or ()),
-        ),
-        site_sigma_m=site_sigma_m,
-        reach_m=search_m,
-        images=tuple(images or ()),
-        excluded=tuple(exclude or ()),
+    required = replace(required, min_share=min_share / 100.0)
+    sites = (
+        *map(SiteFile, site or ()),
+        *(SiteFile(path, is_control=True) for path in control_site or ()),
     )
-    required = RequiredQuality(points_per_km2, min_share / 100.0, min_views, ce90_m, le90_m)
-    if dem is None and (exclude_heights or land_cover or vertical or geoid):
-        raise InputError(
-            "--exclude-heights, --land-cover, --vertical, --geoid: of the heights of --dem, which is "
-            "missing; add it"
-        )
+    references = replace(references, sites=sites, heights=heights.files())
     is_folder = (Path(block) / BLOCK_JSON).is_file()
-    if (
-        not is_folder
-        and output is None
-        and (references, required)
-        == (
-            QualityReferences(),
-            RequiredQuality(),
-        )
-    ):
+    is_asked = output is not None or (references, required) != (QualityReferences(), RequiredQuality())
+    if not (is_folder or is_asked):
         _show_kept(block, as_json=as_json)
         return
     with shown_progress() as progress:

@@ -11,6 +11,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from amers.app.cli.arguments import CheckedCommand
+from amers.app.cli.options import with_options
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,7 @@ def _load(name: str, entry: Command | Group) -> Any:
     if isinstance(entry, Group):
         return GroupOnDemand(entry.commands, name=name, help=entry.help, no_args_is_help=True)
     module, _, function = entry.function.partition(":")
+    command = with_options(getattr(import_module(f"amers.app.cli.{module}"), function))
     one = typer.Typer(add_completion=False)
-    one.command(name, cls=CheckedCommand)(getattr(import_module(f"amers.app.cli.{module}"), function))
+    one.command(name, cls=CheckedCommand)(command)
     return get_command(one)

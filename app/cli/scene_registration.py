@@ -255,12 +255,6 @@ def worst_status(outcomes: Sequence[Outcome]) -> int:
     )
 
 
-def failure_text(outcome: Outcome) -> str:
-    """The reason of a failure, with the image that it is about."""
-    image, reason = str(outcome["scene"]), str(outcome["reason"])
-    return reason if image in reason else f"{image}: {reason}"
-
-
 def _check_figures(checks: list[dict[str, Any]]) -> dict[str, Any]:
     """The figures to show of independent check points, if there are any."""
     if not checks:

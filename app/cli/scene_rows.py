@@ -5,6 +5,10 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import typer
+
+from amers.app.cli.arguments import by_options
+from amers.app.cli.exit_status import SUCCESS
 from amers.app.cli.output import print_json, show, show_one
 from amers.app.cli.scene_registration import Outcome
 from amers.app.errors import InputError
@@ -30,6 +34,15 @@ def refuse_shared_files(scenes: list[Path], files_of_one: list[str]) -> None:
         raise InputError(
             "several scenes of the same name would write into the same folder; register them separately"
         )
+
+
+def show_failures(outcomes: list[Outcome], context: typer.Context) -> None:
+    """Print why scenes failed; the reasons get the names of options in place of those of inputs."""
+    for outcome in outcomes:
+        outcome["reason"] = reason = by_options(outcome["reason"], context)
+        if outcome["exit_status"] != SUCCESS:
+            image = str(outcome["scene"])
+            typer.echo(f"amers: {reason if image in reason else f'{image}: {reason}'}", err=True)
 
 
 def show_outcome(outcome: Outcome, *, as_json: bool) -> None:

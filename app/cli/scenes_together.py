@@ -1,18 +1,42 @@
 """`amers scene register-many`: scenes registered in one adjustment."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from amers.app.cli.arguments import by_options
-from amers.app.cli.exit_status import SUCCESS
 from amers.app.cli.joint_registration import JointRequest, register_together
+from amers.app.cli.options import FromCenti, FromMilli
 from amers.app.cli.output import AsJson, print_json, show_one
-from amers.app.cli.scene_registration import failure_text, images_of, worst_status
-from amers.app.cli.scene_rows import refuse_shared_files, show_outcomes
+from amers.app.cli.scene_registration import images_of, worst_status
+from amers.app.cli.scene_rows import refuse_shared_files, show_failures, show_outcomes
 from amers.app.usecases.registration.register import SceneFiles
 from amers.services.sensors.parameter_sets import parameter_set_named
+
+
+@dataclass(frozen=True)
+class JointOptions:
+    """What scenes are registered on together, and what the result must reach.
+
+    Attributes:
+        block: use the points of this block folder instead of the store.
+        join: output folder of scenes registered together before; they stay as they are.
+        sigma_m: accuracy of the models, one sigma, metres.
+        bands: bands to use: 2, or 1,2,3 for their mean, or 3:0.3,2:0.7.
+        rigorous: adjust orbit, attitude and camera of the scenes whose metadata have a rigorous model:
+            srp, toutin or spot-hrv.
+        max_ce90_on_earth_m: largest CE90 on the Earth, metres: with the frame of the points.
+        copy_image: copy GeoTIFFs with the refined model in their tags.
+    """
+
+    block: Path | None = None
+    join: Path | None = None
+    sigma_m: FromCenti = None
+    bands: str | None = None
+    rigorous: str | None = None
+    max_ce90_on_earth_m: FromMilli = None
+    copy_image: bool = False
 
 
 def register_many(
@@ -21,37 +45,7 @@ def register_many(
         list[Path], typer.Argument(help="GeoTIFF, JPEG 2000 or NITF, or folders of such images.")
     ],
     *,
-    block: Annotated[
-        Path | None,
-        typer.Option(exists=True, help="Use the points of this block folder instead of the store."),
-    ] = None,
-    join: Annotated[
-        Path | None,
-        typer.Option(
-            exists=True,
-            help="Output folder of scenes registered together before; they stay as they are.",
-        ),
-    ] = None,
-    sigma_m: Annotated[
-        float | None, typer.Option(help="Accuracy of the models, one sigma, metres.", min=0.01)
-    ] = None,
-    bands: Annotated[
-        str | None, typer.Option(help="Bands to use: 2, or 1,2,3 for their mean, or 3:0.3,2:0.7.")
-    ] = None,
-    rigorous: Annotated[
-        str | None,
-        typer.Option(
-            help="Adjust orbit, attitude and camera of the scenes whose metadata have a rigorous model: "
-            "srp, toutin or spot-hrv."
-        ),
-    ] = None,
-    max_ce90_on_earth_m: Annotated[
-        float | None,
-        typer.Option(help="Largest CE90 on the Earth, metres: with the frame of the points.", min=0.001),
-    ] = None,
-    copy_image: Annotated[
-        bool, typer.Option("--copy-image", help="Copy GeoTIFFs with the refined model in their tags.")
-    ] = False,
+    options: JointOptions,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Folder; each scene gets one inside it.")
     ] = Path("registered"),
@@ -64,24 +58,25 @@ def register_many(
     out. The folder OUTPUT/block holds the report on all scenes. The points come from the store unless
     --block is given.
     """
+    rigorous = options.rigorous
     if rigorous is not None:
         parameter_set_named(rigorous)
     images = images_of(scenes)
     refuse_shared_files(images, [])
     request = JointRequest(
-        files=[SceneFiles(image, None, sigma_m, bands, rigorous=rigorous) for image in images],
+        files=[
+            SceneFiles(image, None, options.sigma_m, options.bands, rigorous=rigorous)
+            for image in images
+        ],
         output=output,
-        block=block,
-        joined=join,
-        copy_image=copy_image,
-        max_ce90_on_earth_m=max_ce90_on_earth_m,
+        block=options.block,
+        joined=options.join,
+        copy_image=options.copy_image,
+        max_ce90_on_earth_m=options.max_ce90_on_earth_m,
         jobs=jobs,
     )
     outcomes, joint = register_together(request)
-    for outcome in outcomes:
-        outcome["reason"] = by_options(outcome["reason"], context)
-        if outcome["exit_status"] != SUCCESS:
-            typer.echo(f"amers: {failure_text(outcome)}", err=True)
+    show_failures(outcomes, context)
     if as_json:
         print_json({**joint, "scenes": outcomes})
     else:

@@ -16,11 +16,12 @@ UNSTEADY = ("water", "snow and ice")
 
 @dataclass(frozen=True)
 class GroundFiles:
-    """Files about the ground of a block.
+    """Files about the ground of a block. Classes of ESA WorldCover have names, those of others numbers.
 
     Attributes:
-        exclude: GeoJSON or images on a map: ground without points.
-        land_cover: image on a map; classes of ESA WorldCover by name, others by number.
+        exclude: ground without points: GeoJSON polygons, or an image on a map; repeat for several.
+        land_cover: image of land cover classes: the typology of the points; water, snow and ice get
+            none.
     """
 
     exclude: tuple[Path, ...] = ()

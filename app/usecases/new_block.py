@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -24,17 +24,24 @@ from amers.services.types import Acquisition, Array, ControlPoints
 class BlockIdentity:
     """Name, version, title and licence of a new block.
 
+    An id is a letter, then letters, digits, dots, dashes or underscores. A changed block needs a new
+    version. Without a title, people see the id.
+
     Attributes:
-        id: a letter, then letters, digits, dots, dashes or underscores.
-        version: of the block; a changed block needs a new version.
-        title: for people; by default the id.
-        license: of the points and chips, an SPDX identifier or "proprietary".
+        id: id of the block; by default the folder's name.
+        version: version of the block.
+        title: title of the block.
+        license: licence: SPDX identifier.
     """
 
-    id: str
+    id: str = ""
     version: str = "1"
     title: str = ""
     license: str = "proprietary"
+
+    def named_after(self, folder: Path) -> "BlockIdentity":
+        """The same with the name of the block's folder in place of an id that is missing."""
+        return replace(self, id=self.id or folder.name)
 
 
 def refuse_existing(folder: Path) -> None:

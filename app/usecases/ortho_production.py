@@ -35,15 +35,15 @@ class OrthoFiles:
     """Ortho-images in files, and the heights of their ground.
 
     Attributes:
-        images: GeoTIFF (or COG) or JPEG 2000 on a map, of one place; the most accurate first.
+        images: GeoTIFF (or COG) or JPEG 2000 on a map; several of one place, the most accurate first.
         terrain: heights of the ground; None takes `flat_m` everywhere.
-        flat_m: height of flat ground, metres above the ellipsoid.
-        height_sigma_m: one standard deviation of the heights, metres; required with `flat_m`.
-        sigma_m: accuracy of the images on the map, metres; by default that of their sensors.
-        frame_sigma_up_m: error that all the heights share, one standard deviation, metres; None when
-            unknown.
-        bands: see `amers.services.formats.images.bands.parse_bands`.
-        mask: image of the same ground; points are avoided where it is not zero.
+        flat_m: height of flat ground above the ellipsoid, metres; replaces --dem.
+        height_sigma_m: sigma of the heights, metres; by default 0.1 of the terrain's step.
+        sigma_m: accuracy of the images on the map, one sigma, metres; by default that of their
+            sensors.
+        frame_sigma_up_m: error that all the heights share, one sigma, metres; by default unknown.
+        bands: bands to use: 2, or 1,2,3, or 3:0.3,2:0.7.
+        mask: image of the same ground; no points where it is not 0.
     """
 
     images: tuple[Path, ...]

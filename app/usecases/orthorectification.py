@@ -59,8 +59,8 @@ class OrthoMap:
     """The map of an ortho-image.
 
     Attributes:
-        crs: coordinate reference system; by default the UTM zone of the scene's centre.
-        gsd_m: ground sampling in metres; by default that of the scene.
+        crs: coordinate reference system of the map; by default the UTM zone.
+        gsd_m: ground sampling, metres; by default that of the scene.
     """
 
     crs: str | None = None

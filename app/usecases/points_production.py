@@ -38,20 +38,19 @@ class KnownPointFiles:
     """Points of another base in a file, and the images or the folder that give them chips.
 
     Attributes:
-        points: in any format of `amers.services.formats.gcp.reader`.
-        images: with registered models, or ortho-images; the most accurate first. None where the base has
-            chips of its own.
-        chips: folder of the chips of the base; None where images give them.
-        chip_origin: see `amers.services.formats.gcp.base_chips.read_base_chips`.
+        points: points: GCPLib, Copernicus GCP database, CSV, ASP, OPF, GeoJSON, ODM, QGIS, ENVI, PCI.
+        images: image with a registered model, or on a map; repeat, the most accurate first.
+        chips: folder of the base's own chips, in place of images: GCPLib, Copernicus GCP database.
+        chip_origin: origin of the pixels of GCPLib's chips: centre, corner, centre-1, corner-1.
         stated: what the file of the points does not state.
         point_sigma_m: horizontal and up, one standard deviation, of points whose file states none.
         terrain: gives the heights of points without any.
-        height_sigma_m: one standard deviation of the heights of the terrain; by default a tenth of the
-            distance of its nodes.
-        sigma_m: accuracy of the images' models, metres; by default that of the producer or the sensor.
-        frame_sigma_m, frame_sigma_up_m: error on the Earth that all points of the base share, metres;
-            None when unknown.
-        bands: see `amers.services.formats.images.bands.parse_bands`.
+        height_sigma_m: sigma of the heights of --dem, metres; by default 0.1 of its step.
+        sigma_m: accuracy of the images' models, one sigma, metres; by default that of the producer or
+            the sensor.
+        frame_sigma_m: error that all points share, horizontal, one sigma, metres; by default unknown.
+        frame_sigma_up_m: the same of their heights.
+        bands: bands to use: 2, or 1,2,3, or 3:0.3,2:0.7.
     """
 
     points: Path

@@ -23,11 +23,10 @@ class SceneModel:
     """A scene and its model.
 
     Attributes:
-        image: of the scene.
-        model: file of its model; None finds it by its name.
-        registration: folder with the outputs of its registration; None when it is not registered.
-        sigma_m: accuracy on the Earth of a model that is not registered, one standard deviation of each
-            coordinate, metres; None when unknown.
+        image: raw image: GeoTIFF, JPEG 2000 or NITF.
+        model: file of the delivered model; by default found by its name.
+        registration: folder of the scene's registration (`amers scene register -o`).
+        sigma_m: accuracy of a model that is not registered, one sigma, metres; by default unknown.
     """
 
     image: Path

@@ -16,10 +16,10 @@ class TerrainFile:
     """A terrain in a file.
 
     Attributes:
-        dem: file with the heights.
-        vertical: vertical datum of the heights, where the file does not state it; see `read_dem`.
-        geoid: grid file of the geoid, where PROJ has none.
-        fill_px: voids are filled from heights at most this many nodes away.
+        dem: GeoTIFF with the heights of the ground.
+        vertical: vertical datum of the heights: ellipsoid, EGM96, EGM2008, EPSG:…
+        geoid: grid file of the geoid, GTX or GeoTIFF.
+        fill_px: fill voids of the terrain from this many nodes away.
         geoid_option: what gives `geoid`, for the error when the grid is missing.
     """
 

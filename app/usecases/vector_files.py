@@ -40,8 +40,8 @@ class VectorOptions:
 
     Attributes:
         pixels: origin and signs of the pixel coordinates, see `line_sample_of_xy`.
-        tolerance_px: edges get more vertices where they bend by more, pixels.
-        skip_missed: leave out features with a place that meets no ground; refuse them otherwise.
+        tolerance_px: add vertices where an edge bends by more, pixels.
+        skip_missed: leave out features that meet no ground, which are refused otherwise.
     """
 
     pixels: PixelOrigin = "qgis"
@@ -54,9 +54,9 @@ class CorrectionOptions(VectorOptions):
     """How vectors of a raw image come onto the map.
 
     Attributes:
-        margin_px: by which digitised vertices may lie outside the image.
-        sigma_px: precision of digitised vertices, one standard deviation a coordinate.
-        height_sigma_m: of the terrain, one standard deviation; by default a tenth of its posting.
+        margin_px: vertices may lie this far outside the image, pixels.
+        sigma_px: precision of the digitised vertices, one sigma, pixels.
+        height_sigma_m: accuracy of the heights, one sigma; by default 0.1 postings.
     """
 
     margin_px: float = 5.0
@@ -69,7 +69,7 @@ class ProjectionOptions(VectorOptions):
     """How vectors of the map come into a raw image.
 
     Attributes:
-        clip: cut features at the border of the image.
+        clip: cut at the border of the image.
     """
 
     clip: bool = False

@@ -36,8 +36,8 @@ class OrthoOptions:
 
     Attributes:
         kernel: "cubic" (convolution, a = -0.5) or "bilinear".
-        tolerance_px: largest error of the interpolated positions, pixels of the scene.
-        hide: write nodata for ground that other ground hides from the sensor.
+        tolerance_px: largest allowed error of the mapping, pixels.
+        hide: leave out ground that other ground hides from the sensor.
         window_px: side of the windows of the map, pixels.
     """
 

@@ -52,11 +52,10 @@ class ProductionOptions:
 
     Attributes:
         fine_gsd_m, coarse_gsd_m: ground samplings of the chips, metres.
-        spacing_m: side of the squares of ground that get one point each; None divides the ground into
-            about `points` squares.
-        points: number of points aimed at when there is no spacing.
+        spacing_m: one point per square of this side, metres.
+        points: desired number of points; --spacing-m overrides it.
         candidates: number of tie points of every square that are tried.
-        min_views: smallest number of images that show a point.
+        min_views: least number of images that see a point.
         min_saliency: smallest saliency of a point's chip.
         max_sigma_m: largest horizontal standard deviation of a point within the block.
         max_sigma_up_m: largest vertical standard deviation of a point within the block.

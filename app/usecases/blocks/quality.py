@@ -82,13 +82,10 @@ class QualityReferences:
     Attributes:
         heights: None compares no heights.
         sites: places with ortho-images.
-        site_sigma_m: accuracy of the ortho-images on the Earth, one standard deviation a coordinate;
-            None when unknown.
-        reach_m: largest shift between the block and the ortho-images; None takes three standard
-            deviations of both.
-        images: of the block, to be compared with the ortho-images; their adjusted models are those of
-            the block.
-        excluded: masks of ground where no points are expected.
+        site_sigma_m: accuracy of these images, one sigma a coordinate, metres.
+        reach_m: largest shift searched at sites; by default 3 sigma of what is declared.
+        images: image of the block (folders only), to be compared with the sites; repeat.
+        excluded: ground without points, such as water: GeoJSON, or image other than 0; repeat.
     """
 
     heights: HeightFiles | None = None
@@ -104,10 +101,11 @@ class RequiredQuality:
     """Requirements that replace those that the block itself specifies.
 
     Attributes:
-        points_per_km2: density of every cell of 0.1 degree; None takes that of the block.
+        points_per_km2: required density; by default that of the block.
         min_share: share of the ground, by cells, that shall reach the density, 0 to 1.
-        min_views: number of images that shall show every point; None takes that of the block.
-        ce90_m, le90_m: largest CE90 and LE90 on the Earth; None requires nothing.
+        min_views: required images of a point; by default as specified.
+        ce90_m: required CE90 on the Earth, metres.
+        le90_m: required LE90 on the Earth, metres.
     """
 
     points_per_km2: float | None = None

@@ -1,0 +1,37 @@
+"""The options that give a terrain."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from amers.app.cli.options import Shown
+from amers.app.usecases.terrain_file import TerrainFile
+
+
+@dataclass(frozen=True)
+class TerrainOptions:
+    """A terrain, or none.
+
+    Attributes:
+        dem: GeoTIFF with the heights of the ground.
+        vertical: vertical datum of the heights: ellipsoid, EGM96, EGM2008, EPSG:…
+        geoid: grid file of the geoid, GTX or GeoTIFF.
+    """
+
+    dem: Path | None = None
+    vertical: str | None = None
+    geoid: Path | None = None
+
+    @property
+    def terrain(self) -> TerrainFile | None:
+        """The terrain; None without --dem."""
+        return None if self.dem is None else TerrainFile(self.dem, self.vertical, self.geoid)
+
+
+Terrain = Annotated[
+    TerrainFile,
+    Shown(dem=typer.Option(exists=True), vertical=None, geoid=None, fill_px=typer.Option(min=0, max=50)),
+]
+"""A terrain without which a command does nothing."""
