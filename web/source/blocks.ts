@@ -163,9 +163,9 @@ function assessmentForm(number: string): HTMLElement {
   const form = h(
     "form",
     { onsubmit: (event) => void submit(event) },
-    h("p", { class: "quiet" }, "Files lie below the reference folder of the server. Nothing is required; what is missing is not measured."),
+    h("p", { class: "quiet" }, "Files lie below the reference folder of the server. No file is required; figures without their file are left out."),
     ...labelled(sites, "Reference ortho-images", "for checks only; names, separated by commas"),
-    ...labelled(controlSites, "Ortho-images used as control", "told apart"),
+    ...labelled(controlSites, "Ortho-images used as control", "reported separately"),
     ...labelled(dem, "Height model", "GeoTIFF"),
     ...labelled(vertical, "Its vertical datum", "ellipsoid, EGM96, EPSG:…"),
     ...labelled(density, "Required density", "points per km²; by default that of the block"),

@@ -157,7 +157,7 @@ class Drawing {
   private offerTerrains(): void {
     const names = this.scene.models.filter((name) => TERRAINS.test(name));
     fill(this.terrain, ...names.map((name) => h("option", { value: name }, name)));
-    if (!names.length) fill(this.terrain, h("option", { value: "" }, "none beside the image yet: add one"));
+    if (!names.length) fill(this.terrain, h("option", { value: "" }, "none uploaded yet: add one"));
   }
 
   /** The inputs of both processes, after the upload of a new terrain and of vectors. */

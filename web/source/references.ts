@@ -43,7 +43,7 @@ export const showReferences: ShowPart = async ({ content, signal, change }) => {
   }
 
   async function drop({ name }: Reference): Promise<void> {
-    const text = "Scenes are no longer registered on it, and what was learnt about its places is forgotten. Its files stay in their folder.";
+    const text = "Scenes are no longer registered on it, and the record of its places is deleted. Its files stay in their folder.";
     if ((await ask({ title: `Remove ${name}?`, text, act: "Remove" })) === null) return;
     await change(async () => {
       await remove(`references/${encodeURIComponent(name)}`);

@@ -57,7 +57,7 @@ export const showScene: ShowView = async ({ panel, atlas, signal }, id) => {
       Acquired: when(scene.acquired),
       Sensor: scene.sensor,
       "Ground sampling": scene.gsd_m == null ? null : figure(scene.gsd_m, "m"),
-      "Files beside it": scene.models.join(", "),
+      "Accompanying files": scene.models.join(", "),
       "Accuracy of its model as stated": scene.sigma_m == null ? "unknown" : figure(scene.sigma_m, "m"),
       Uploaded: when(scene.created),
     }),

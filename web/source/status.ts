@@ -29,7 +29,7 @@ export const showStatus: ShowPart = async ({ content, signal, change }) => {
       "Damaged files": figure(now.damaged_files),
     }),
     h("h2", {}, "Owners"),
-    owners.length ? h("ul", { class: "list story", "aria-label": "Owners" }, ...owners.map(row)) : h("p", { class: "quiet" }, "Nobody keeps anything."),
+    owners.length ? h("ul", { class: "list story", "aria-label": "Owners" }, ...owners.map(row)) : h("p", { class: "quiet" }, "No stored data."),
     h("p", {}, h("button", { type: "button", onclick: () => void change(async () => "The figures are new.") }, "Refresh")),
   );
 };

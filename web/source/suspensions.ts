@@ -25,7 +25,7 @@ export const showSuspensions: ShowPart = async ({ content, signal, change }) => 
 
   async function suspend({ id, properties }: PointHistory): Promise<void> {
     const reason = `succeeds in ${properties.successes} of ${plural(properties.attempts, "scene")}, ${figure(properties.expected)} expected`;
-    const text = "Neither registrations nor readers get it any more, until it is reinstated.";
+    const text = "Registrations and readers no longer get it until it is reinstated.";
     const because = await ask({ title: `Suspend point ${id}?`, text, act: "Suspend", field: { label: "Reason", value: reason } });
     if (because === null) return;
     await change(async () => {
