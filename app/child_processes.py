@@ -1,4 +1,4 @@
-"""Python processes that this one starts: none of them runs code that lies in the working folder.
+"""Child processes in Python: none of them runs code from the working folder.
 
 Python looks for modules in the working folder first when it is given a statement (`-c`) or a module
 (`-m`). People work in folders that were unpacked from deliveries: a `numpy.py` beside the images must

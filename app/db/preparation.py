@@ -1,4 +1,4 @@
-"""What a database of your own has before Amers makes its tables: checked, and told with the statements.
+"""Preparation of a database of your own: checks before Amers makes its tables, with the statements.
 
 A superuser prepares the database once. Amers makes PostGIS only where its role may.
 """

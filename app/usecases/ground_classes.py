@@ -1,4 +1,4 @@
-"""Ground of a new block: where no points are wanted, and what the points stand on."""
+"""Ground of a new block: excluded areas, and the land cover at the points."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Checks of jobs on an uploaded scene: of the scene, its registration, and names of files beside it."""
+"""Checks of jobs on an uploaded scene: of the scene, its registration, and names of its files."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,4 +1,4 @@
-"""Upload, list and remove scenes, and the files beside their images."""
+"""Upload, list and remove scenes and their files."""
 
 import logging
 import re

@@ -1,4 +1,4 @@
-"""What an adjusted block knows: its frame on the Earth, and its points relative to that frame."""
+"""Accuracy of an adjusted block: of its frame on the Earth, and of its points relative to that frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

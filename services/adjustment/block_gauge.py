@@ -1,4 +1,4 @@
-"""What tie points leave open: place and linear shape of connected images, left to the priors alone."""
+"""The gauge of a block: position and linear shape, which tie points do not determine and priors do."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The translation of an adjusted block onto known ground, and what is then known of its frame."""
+"""The translation of an adjusted block onto known ground, and the accuracy of its frame after that."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""The parameters of the images of an adjusted block in their own units, and which of them are held."""
+"""The parameters of the images of an adjusted block in their units, and those that stay undetermined."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

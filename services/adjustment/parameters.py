@@ -1,4 +1,4 @@
-"""What may move in a block adjustment: the free parameters of images, with their a priori accuracy."""
+"""The free parameters of images in a block adjustment, with their a priori accuracy."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Files that other files name: their paths never leave the folder they are searched in."""
+"""Files that other files refer to: their paths never leave the folder they are searched in."""
 
 from pathlib import Path
 

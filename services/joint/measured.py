@@ -1,4 +1,4 @@
-"""What a scene shows of the control points, before it is adjusted together with others."""
+"""The control points as measured in a scene, before it is adjusted together with others."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -1,4 +1,4 @@
-"""The correction in the image that is nearest to an adjusted model, with what it misses of it."""
+"""The correction in the image that is nearest to an adjusted model, and the difference between both."""
 
 from dataclasses import dataclass, replace
 

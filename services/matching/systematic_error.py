@@ -1,4 +1,4 @@
-"""The systematic error: what all the measures of a scene share, and no number of points averages out."""
+"""The systematic error of all measures of a scene, which no number of points averages out."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The views of a point that look most like a scene."""
+"""Selection of the views of a point that are most similar to a scene."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""A displacement beyond an affine correction: what scanners, optics and rectification do.
+"""A displacement beyond an affine correction, with components for scanners, optics and rectification.
 
 The displacement of each coordinate is a sum of Gaussian processes, the components. Those of images that
 were scanned depend on the line or the sample: smooth ones (bow, slow attitude, distortion of the

@@ -1,4 +1,4 @@
-"""The measures of a scene at their places: what the tests of their residuals and its profile work on."""
+"""The measures of a scene with their positions: input of the tests of residuals and of the profile."""
 
 from dataclasses import dataclass, replace
 from typing import Self

@@ -1,4 +1,4 @@
-"""What moves the lines and samples of a scene, as its measures and the breaks of its image show."""
+"""The motion of lines and samples of a scene, from its measures and the breaks of its image."""
 
 from dataclasses import dataclass, replace
 

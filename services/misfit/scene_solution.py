@@ -1,4 +1,4 @@
-"""The last least squares of a scene, once it is known which measures agree and how they err."""
+"""The last least-squares solution of a scene, with the agreeing measures and their errors known."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

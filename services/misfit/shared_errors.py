@@ -1,4 +1,4 @@
-"""Errors that the points of a scene share: what more points do not average out.
+"""Common errors of the points of a scene, which more points do not average out.
 
 Three kinds are told from the residuals of a scene:
 

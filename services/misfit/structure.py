@@ -1,4 +1,4 @@
-"""Structure in the residuals of a scene: what errors of single points do not explain.
+"""Structure in the residuals of a scene that errors of single points do not explain.
 
 Residuals of a correction that fits are independent. Each family of shapes below is a way in which they
 are not: a scanner that shakes or bends along the lines, lines that were lost or repeated, detectors out

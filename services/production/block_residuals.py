@@ -1,4 +1,5 @@
-"""How images and points fit the adjustment of their block: residuals, corrections, and what is odd."""
+"""Fit of images and points in the adjustment of their block: residuals, corrections, conspicuous
+images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What places a block on the Earth, from all kinds of control."""
+"""Control of all kinds, which places a block on the Earth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""What a block shall reach, criterion by criterion: met, missed, or not shown by what was measured."""
+"""Requirements on a block, criterion by criterion: met, missed, or not shown by the measurements."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

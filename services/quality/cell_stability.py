@@ -1,4 +1,4 @@
-"""What points share with their neighbours: the adjustment repeated without one cell at a time."""
+"""Common errors of neighbouring points: the adjustment repeated without one cell at a time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What is known of the errors of a registered model, as its correction is delivered."""
+"""Accuracy of a registered model, as stated with its delivered correction."""
 
 from dataclasses import dataclass
 

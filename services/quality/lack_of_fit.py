@@ -1,4 +1,5 @@
-"""Lack of fit: what the residuals of a registration still depend on, tested and named."""
+"""Lack of fit: tests of the residuals of a registration for structure, each named with possible
+causes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Accuracy all over the image, predicted by the covariance of the correction and the frame."""
+"""Predicted accuracy over the whole image, from the covariances of the correction and the frame."""
 
 from dataclasses import dataclass
 

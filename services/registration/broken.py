@@ -1,4 +1,4 @@
-"""What the refusal of a scene says where lines of its image were lost or repeated."""
+"""The refusal of a scene whose image has lost or repeated lines names these lines."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

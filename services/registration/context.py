@@ -1,4 +1,4 @@
-"""What the stages of a registration share: the context of the work, and the current prediction."""
+"""The context of a registration, common to all its stages, and the current prediction."""
 
 import math
 from collections.abc import Iterator

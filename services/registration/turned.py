@@ -1,4 +1,4 @@
-"""Models of an image that was turned: the mistake that lies behind many a scene that cannot be found."""
+"""Models of an image that was turned, a common reason why a scene is not found."""
 
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What happens to light between the ground and a satellite: aberration, travel time and refraction."""
+"""The path of light from the ground to a satellite: aberration, travel time and refraction."""
 
 import math
 from dataclasses import dataclass

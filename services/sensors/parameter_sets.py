@@ -1,4 +1,4 @@
-"""The published sets of free terms of rigorous models, with what is expected of each term."""
+"""The published sets of free terms of rigorous models, with the a priori sigma of each term."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

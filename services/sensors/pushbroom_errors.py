@@ -1,4 +1,4 @@
-"""What may be wrong in a rigorous model: attitude, orbit and focal length, and the model without it."""
+"""Errors of a rigorous model in attitude, orbit and focal length, and the model without them."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property

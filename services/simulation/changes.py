@@ -1,4 +1,4 @@
-"""What changes on the ground over the years: places that are built anew, and things that come and go."""
+"""Changes on the ground over the years: new buildings, and objects that appear and disappear."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What sensor models do not describe: jitter, bows, lost lines, seams, moved ground, swapped axes."""
+"""Distortions without a sensor model: jitter, bows, lost lines, seams, moved ground, swapped axes."""
 
 from collections import OrderedDict
 from dataclasses import dataclass

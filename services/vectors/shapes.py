@@ -1,4 +1,4 @@
-"""Geometries as arrays of vertices, in which what neighbours share is there once, and back."""
+"""Geometries as arrays of vertices without duplicates, and back."""
 
 from dataclasses import dataclass, replace
 
