@@ -8,8 +8,9 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "modules.md"
 HEAD = """# Modules
 
-Every module of `services` and `app`, with the first line of its docstring. `scripts/make_module_list.py`
-writes this page; [architecture](architecture.md) explains how the packages depend on each other.
+Every module of `amers`, `services` and `app`, with the first line of its docstring.
+`scripts/make_module_list.py` writes this page; [architecture](architecture.md) explains how the packages
+depend on each other.
 """
 
 
@@ -21,13 +22,15 @@ def first_line(path: Path) -> str:
 def module_list(root: Path = ROOT) -> str:
     """Markdown of the page."""
     parts = [HEAD]
+    packages = [root / "amers"]
     for top in ("services", "app"):
-        for package in sorted(path.parent for path in (root / top).rglob("__init__.py")):
-            modules = sorted(path for path in package.glob("*.py") if path.name != "__init__.py")
-            rows = "".join(f"| `{path.name}` | {first_line(path)} |\n" for path in modules)
-            table = f"\n| module | content |\n|---|---|\n{rows}" if rows else ""
-            name = package.relative_to(root).as_posix()
-            parts.append(f"\n## {name}\n\n{first_line(package / '__init__.py')}\n{table}")
+        packages += sorted(path.parent for path in (root / top).rglob("__init__.py"))
+    for package in packages:
+        modules = sorted(path for path in package.glob("*.py") if path.name != "__init__.py")
+        rows = "".join(f"| `{path.name}` | {first_line(path)} |\n" for path in modules)
+        table = f"\n| module | content |\n|---|---|\n{rows}" if rows else ""
+        name = package.relative_to(root).as_posix()
+        parts.append(f"\n## {name}\n\n{first_line(package / '__init__.py')}\n{table}")
     return "".join(parts)
 
 
