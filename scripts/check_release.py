@@ -109,7 +109,7 @@ def check_installed(installation: Installation) -> None:
     python = installation.bin / "python"
     told = installation.run(installation.bin / "amers", "--version").strip()
     require(told == version(), f"version {told}, {version()} expected")
-    require(installation.run(python, "-P", "-m", "amers", "--version").strip() == version(), "-m amers")
+    require(installation.run(python, "-m", "amers", "--version").strip() == version(), "-m amers")
     printed = installation.program(NAMES)
     require(printed.startswith(f"{version()} AmersError Block Client "), printed)
     packages = Path(installation.run(python, "-P", "-c", "import amers; print(amers.__file__)")).parents[

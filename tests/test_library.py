@@ -59,6 +59,22 @@ def test_the_import_of_amers_loads_nothing():
     assert set(beyond_budget(imported_by(light), {"importlib.metadata"})) == {"httpx"}
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("-m", "amers", "scene", "register", "--help"),
+        ("-c", "import amers; amers.register; import sys; assert sys.path[0] == ''"),
+        ("program.py",),
+    ],
+    ids=["module", "statement", "program"],
+)
+def test_modules_of_the_working_folder_are_not_imported(words: tuple[str, ...], tmp_path: Path):
+    write_modules_of_others(tmp_path)
+    (tmp_path / "program.py").write_text("import amers\n\namers.register\n")
+    subprocess.run([sys.executable, *words], cwd=tmp_path, check=True, capture_output=True)
+
+
 def test_the_names_for_type_checkers_are_those_that_are_loaded():
     tree = ast.parse(Path(amers.__file__).read_text())
     condition = next(node for node in tree.body if isinstance(node, ast.If))
