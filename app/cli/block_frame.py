@@ -32,7 +32,7 @@ def frame(
         list[Path] | None,
         typer.Option(
             exists=True,
-            help="Control that takes no part and tells how good the result is: blocks, or files of "
+            help="Control that takes no part and measures the result: blocks, or files of "
             "points with the accuracy that --control-sigma-m and the others state; repeat for several.",
         ),
     ] = None,

@@ -66,7 +66,7 @@ COMMANDS: Tree = {
             ),
             "suspend": Command(
                 "points:suspend",
-                "Suspend a point: neither registrations nor readers get it any more.",
+                "Suspend a point: registrations and readers no longer get it.",
             ),
             "reinstate": Command(
                 "points:reinstate",
@@ -131,7 +131,7 @@ COMMANDS: Tree = {
             ),
             "plan": Command(
                 "planning:plan",
-                "Predict the accuracy of a block, and say where one more known site would help most.",
+                "Predict the accuracy of a block, and find where one more known site helps most.",
             ),
             "run": Command(
                 "image_production:run",
@@ -184,7 +184,7 @@ COMMANDS: Tree = {
             ),
             "usage": Command(
                 "store:show_usage",
-                "Show what every owner keeps in the storage, and what belongs to nobody.",
+                "Show the storage that every owner uses, and files without an owner.",
             ),
             "sweep": Command(
                 "store:sweep",

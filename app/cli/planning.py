@@ -27,7 +27,7 @@ def plan(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Predict the accuracy of a block, and say where one more known site would help most.
+    """Predict the accuracy of a block, and find where one more known site helps most.
 
     No pixel is read: places and directions of the images, sigmas of measures and models, and the
     accuracy of known sites give the covariance that the adjustment will declare.

@@ -29,7 +29,7 @@ def suspend(
     because: Annotated[str, typer.Option(help="Reason; it is recorded.")],
     as_json: AsJson = False,
 ) -> None:
-    """Suspend a point: neither registrations nor readers get it any more."""
+    """Suspend a point: registrations and readers no longer get it."""
     with transaction() as connection:
         suspended = history.suspend_point(connection, point, because)
     show_one(vars(suspended), as_json=as_json)

@@ -40,7 +40,7 @@ def serve(
     port: Annotated[
         int | None, typer.Option(help="Port to listen on; default AMERS_PORT.", min=1, max=65535)
     ] = None,
-    worker: Annotated[bool, typer.Option(help="Run a worker beside the API.")] = True,
+    worker: Annotated[bool, typer.Option(help="Run a worker together with the API.")] = True,
 ) -> None:
     """Run the API and one worker, until Ctrl-C."""
     settings = read_settings()

@@ -29,7 +29,7 @@ def adopt(as_json: AsJson = False) -> None:
 
 
 def show_usage(as_json: AsJson = False) -> None:
-    """Show what every owner keeps in the storage, and what belongs to nobody."""
+    """Show the storage that every owner uses, and files without an owner."""
     settings = read_settings()
     storage = open_storage(settings)
     with transaction(settings) as connection:

@@ -61,7 +61,7 @@ def list_histories(connection: Connection, state: str, limit: int = 100) -> list
 
 
 def suspend_point(connection: Connection, point_id: int, because: str) -> PointHistory:
-    """Suspend a point: neither registrations nor readers get it any more. It can be reinstated.
+    """Suspend a point: registrations and readers no longer get it. It can be reinstated.
 
     Raises:
         InputError: the reason is empty or too long.

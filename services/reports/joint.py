@@ -331,6 +331,6 @@ def _ground_table(report: JointReport) -> tuple[PublishedTable, list[tuple[float
         rows[0],
         (2,) * 6,
         "Adjusted minus known position of the active control points that two scenes or more show: east, "
-        "north and up. Their known positions hold them, each by its accuracy.",
+        "north and up. Each point is weighted by the accuracy of its known position.",
     )
     return table, rows

@@ -5,10 +5,10 @@ from amers.services.quality.stability import GroupMeans
 from amers.services.reports.numbers import number
 
 CELLS_EXPLANATION = (
-    "Points held out at random leave their neighbours in, so that an error which neighbours share stays "
-    "hidden; without a whole cell it shows. More than about 1.5 times means that points share errors, "
-    "and that more of them promise less than their number. An error that all points share, or that "
-    "reaches over the whole image, shows in neither table. No verdict depends on this."
+    "When points are held out at random, their neighbours remain, and a common error of neighbours "
+    "stays hidden. It appears when a whole cell is held out. A factor above about 1.5 means that points "
+    "have common errors, so that more points add less accuracy than their number suggests. An error of "
+    "all points, or over the whole image, appears in neither table. No verdict depends on this."
 )
 
 

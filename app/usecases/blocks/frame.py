@@ -75,7 +75,7 @@ def place_block(
         images: of the block, in which control is found by the adjusted models; some are enough.
         control: known ground.
         folder: of the new version; must not exist.
-        check: known ground that takes no part, and tells how good the result is.
+        check: known ground that takes no part, and measures the result.
         version: of the new version; by default the next whole number.
         progress: receives the fraction done and a message.
 

@@ -67,8 +67,8 @@ def test_hold_outs_by_cells_stand_beside_those_at_random_with_what_they_show(mat
         assert text.count("times what independent errors give") == 2
         assert f"{means.over_independent:.1f} times what independent errors give" in text
         assert f"{means.over_stated:.1f} times what the stated accuracy gives" in text
-        assert "an error which neighbours share stays hidden" in text
-        assert "An error that all points share" in text
+        assert "a common error of neighbours stays hidden" in text
+        assert "An error of all points" in text
         assert "No verdict depends on this" in text
     assert report_document(report)["cell_stability"]["group_means"] == asdict(means)
 
