@@ -12,8 +12,19 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from unittest.mock import patch
 
 from amers.app.cli.main import main
+from amers.app.config import Settings
 
 Done = subprocess.CompletedProcess[str]
+
+
+def environment_of(settings: Settings, **more: str) -> dict[str, str]:
+    """The environment in which commands work on the database and the data folder of settings."""
+    assert settings.database_url is not None
+    return os.environ | {
+        "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
+        "AMERS_DATA_FOLDER": str(settings.data_folder),
+        **more,
+    }
 
 
 def amers_here(words: Sequence[object], environment: Mapping[str, str]) -> Done:

@@ -20,9 +20,10 @@ from amers.app.db.engine import Connection, Database
 from amers.app.main import create_app
 from amers.app.storage import MARKER, Storage
 from amers.app.usecases.tokens import create_token, list_tokens
+from tests.app.callers import Bearer, Caller
 
 if TYPE_CHECKING:
-    from tests.app import full_storage
+    from tests.app import full_storage, installation
 
 TEMPLATE = "amers_template"
 EMPTY_TEMPLATE = "amers_empty"
@@ -135,9 +136,39 @@ def token(dsn: str) -> Callable[[str], str]:
 
 
 @pytest.fixture
-def bearer(token: Callable[[str], str]) -> Callable[[str], dict[str, str]]:
-    """Makes the headers of a caller with a scope: `client.get(path, headers=bearer("read"))`."""
-    return lambda scope: {"Authorization": f"Bearer {token(scope)}"}
+def bearer(token: Callable[[str], str], request: pytest.FixtureRequest) -> Bearer:
+    """Makes a caller with a scope: `bearer("read").get(path)`; it is also the headers of that caller."""
+
+    def client() -> TestClient:
+        client: TestClient = request.getfixturevalue("client")
+        return client
+
+    return lambda scope: Caller(client, {"Authorization": f"Bearer {token(scope)}"})
+
+
+@pytest.fixture
+def me(client: TestClient, bearer: Bearer) -> Caller:
+    """A caller of the started application who may register scenes."""
+    return bearer("register")
+
+
+@pytest.fixture
+def admin(client: TestClient, bearer: Bearer) -> Caller:
+    """An administrator who calls the started application."""
+    return bearer("admin")
+
+
+@pytest.fixture
+def installation(
+    client: TestClient, me: Caller, settings: Settings, dsn: str, storage: Storage, tmp_path: Path
+) -> Iterator["installation.Installation"]:
+    """An installation without points; the log of its workers is printed when the test fails."""
+    from tests.app.installation import Installation  # which needs this module
+
+    log = tmp_path / "worker.log"
+    log.touch()
+    yield Installation(client, me, settings, dsn, storage, log)
+    print(log.read_text())
 
 
 @pytest.fixture(params=["folder", "bucket"])

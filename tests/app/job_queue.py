@@ -1,7 +1,9 @@
 """Jobs in the queue of a test, in the states that workers bring them into."""
 
+from typing import Any
 from uuid import UUID, uuid4
 
+from amers.app.db import registrations
 from amers.app.db.engine import Connection, Database
 from amers.app.db.jobs import attempts, jobs
 from amers.app.db.jobs.jobs import Job
@@ -44,6 +46,13 @@ def state_of(database: Database, job_id: UUID) -> Job:
         job = jobs.find(connection, job_id)
     assert job is not None
     return job
+
+
+def store_registration(connection: Connection, **stated: Any) -> UUID:
+    """The id of a good registration without scene, job and files, but for what is stated of it."""
+    nothing: dict[str, Any] = {"job_id": None, "scene_id": None, "block_versions": [], "options": {}}
+    nothing |= {"report": {}, "verdict": "good", "files": {}}
+    return registrations.insert_registration(connection, **nothing | stated)
 
 
 def let_lease_lapse(database: Database, job_id: UUID) -> None:

@@ -10,6 +10,7 @@ from amers.app.db import usage
 from amers.app.db.engine import Connection, Database
 from amers.app.storage import Storage
 from amers.app.usecases.jobs import do_attempt
+from tests.app.callers import Caller
 from tests.app.job_queue import claim
 
 LEDGER_PREFIXES = ("scenes", "results", "uploads")
@@ -27,12 +28,12 @@ def bytes_in_ledger(connection: Connection) -> int:
     return sum(one.total_bytes for one in usage.read_all_usage(connection))
 
 
-def make_token(client: TestClient, admin: dict[str, str], **quotas: object) -> dict[str, str]:
-    """The headers of a new caller who may read and register."""
+def make_token(client: TestClient, admin: dict[str, str], **quotas: object) -> Caller:
+    """A new caller who may read and register."""
     body = {"name": f"caller {uuid4()}", "scopes": ["register"], **quotas}
     made = client.post("/tokens", json=body, headers=admin)
     assert made.status_code == 201, made.text
-    return {"Authorization": f"Bearer {made.json()['secret']}"}
+    return Caller(lambda: client, {"Authorization": f"Bearer {made.json()['secret']}"})
 
 
 def job_runner(

@@ -19,6 +19,7 @@ from amers.app.usecases.tokens import create_token
 from amers.services.types import ControlPoints
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.worker_processes import children, wait_until
+from tests.command_line import environment_of
 from tests.factories import MadeBlock, make_block
 from tests.service_process import free_port, until
 
@@ -96,12 +97,8 @@ def _answers(url: str) -> bool:
 @contextmanager
 def running_service(settings: Settings, log: Path, *options: str) -> Iterator[str]:
     """`amers serve` with options on the installation of a test; yields its address."""
-    assert settings.database_url is not None
     port = free_port()
-    environment = os.environ | {
-        "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
-        "AMERS_DATA_FOLDER": str(settings.data_folder),
-    }
+    environment = environment_of(settings)
     command = [sys.executable, "-m", "amers", "serve", "--port", str(port), *options]
     with log.open("wb") as output:
         service = subprocess.Popen(command, env=environment, stdout=output, stderr=output)

@@ -1,7 +1,6 @@
 """A backup is one set of database and files: whole, verified, restored completely or to be continued."""
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -32,6 +31,7 @@ from amers.app.usecases.installation import Installation
 from amers.app.worker.sweep import sweep_files
 from tests.app.conftest import EMPTY_TEMPLATE, fresh_database
 from tests.app.full_storage import Full, another, contents
+from tests.command_line import environment_of
 from tests.statements import run_sql
 from tests.unproven import unproven_storage
 
@@ -59,12 +59,8 @@ def amers(
     settings: Settings, *words: str | Path, killed_at: str = ""
 ) -> "subprocess.CompletedProcess[str]":
     """Run a command on an installation; with `killed_at` it kills itself at a call of a function."""
-    assert settings.database_url is not None
     program = ["-c", KILLED_AT, killed_at] if killed_at else ["-m", "amers"]
-    environment = os.environ | {
-        "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
-        "AMERS_DATA_FOLDER": str(settings.data_folder),
-    }
+    environment = environment_of(settings)
     if settings.storage_url is None:
         environment.pop("AMERS_STORAGE_URL", None)
     return subprocess.run(

@@ -2,7 +2,6 @@
 
 import json
 import os
-from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -30,6 +29,7 @@ from amers.app.usecases.blocks.quality import (
 from amers.app.usecases.terrain_file import TerrainFile
 from amers.services.reports.block_quality import BlockQualityReport
 from amers.services.reports.document import block_quality_schema, report_document
+from tests.app.callers import Bearer
 from tests.app.ledger import job_runner
 from tests.app.quality_world import (
     HEIGHT_BIAS_M,
@@ -262,7 +262,7 @@ def test_a_stored_block_is_assessed_by_a_job_on_files_of_the_server(
     database: Database,
     settings: Settings,
     storage: Storage,
-    bearer: Callable[[str], dict[str, str]],
+    bearer: Bearer,
     report: BlockQualityReport,
 ) -> None:
     with database.transaction() as connection:
@@ -284,9 +284,9 @@ def test_a_stored_block_is_assessed_by_a_job_on_files_of_the_server(
         required={"points_per_km2": 15.0, "ce90_m": 3.0, "le90_m": 5.0},
     )
     assert job["status"] == "successful", job
-    results = client.get(f"/jobs/{job['jobID']}/results", headers=admin).json()
+    results = admin.get(f"/jobs/{job['jobID']}/results").json()
     assert results["specification"] == "missed"
-    document = client.get(results["block_quality.json"]["href"], headers=admin).json()
+    document = admin.get(results["block_quality.json"]["href"]).json()
     schema = client.get("/schemas/block_quality.json").json()
     Draft202012Validator(schema).validate(document)
     assert document["verdict"] == report.verdict
@@ -294,17 +294,11 @@ def test_a_stored_block_is_assessed_by_a_job_on_files_of_the_server(
     site = document["planimetry"][0]["sites"][0]
     assert_allclose(site["accuracy"]["bias_m"], of_folder.bias_m, atol=1e-3)
     assert document["heights"]["on_the_earth"]["n"] == report.heights.on_the_earth.n  # type: ignore[union-attr]
-    page = client.get(results["block_quality.html"]["href"], headers=admin)
+    page = admin.get(results["block_quality.html"]["href"])
     assert page.headers["content-type"].startswith("text/html")
     missing = assess("assess-block", block=str(number), dem="../dem.tif", vertical="ellipsoid")
     assert missing["status"] == "failed"
-    refused = client.post(
-        "/processes/assess-block/execution", json={"inputs": {"block": "none"}}, headers=admin
-    )
+    refused = admin.execute("assess-block", {"block": "none"})
     assert refused.status_code == 404
-    not_allowed = client.post(
-        "/processes/assess-block/execution",
-        json={"inputs": {"block": str(number)}},
-        headers=bearer("register"),
-    )
+    not_allowed = bearer("register").execute("assess-block", {"block": str(number)})
     assert not_allowed.status_code == 403

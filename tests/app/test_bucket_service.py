@@ -1,7 +1,7 @@
 """A service with its files in a bucket: a registration from end to end, and an outage of the bucket."""
 
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,6 +12,7 @@ from amers.app.db import engine
 from amers.app.main import create_app
 from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
 from amers.services.formats.sensor_models.rpc_files import read_rpc
+from tests.app.callers import Bearer
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
 from tests.app.registration_outputs import A_TENTH_OF_A_PIXEL, largest_error_px
 from tests.app.s3_server import running_bucket
@@ -20,7 +21,6 @@ from tests.unproven import unproven_storage
 
 pytestmark = pytest.mark.thorough
 
-Bearer = Callable[[str], dict[str, str]]
 EXECUTE = "/processes/register-scene/execution"
 
 

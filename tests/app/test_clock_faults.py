@@ -5,20 +5,18 @@ import shutil
 import struct
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
 import pytest
-from fastapi.testclient import TestClient
 
 from amers.app.config import Settings
 from amers.app.db import engine
-from amers.app.storage import Storage
 from amers.app.usecases.tokens import create_token
 from tests.app.flat_world import make_flat_world
-from tests.app.worker_processes import ended, running_worker, scene_to_register, under_way, wait_until
+from tests.app.installation import Installation
+from tests.app.worker_processes import wait_until
 from tests.service_process import free_port
 from tests.statements import run_sql
 
@@ -68,8 +66,6 @@ time_t time(time_t *into) {
 }
 """
 
-Bearer = Callable[[str], dict[str, str]]
-
 
 @dataclass(frozen=True)
 class WrongClock:
@@ -111,20 +107,12 @@ def lease(dsn: str) -> object:
 
 
 def test_a_worker_whose_clock_jumps_keeps_its_job(
-    clock: WrongClock,
-    settings: Settings,
-    client: TestClient,
-    bearer: Bearer,
-    storage: Storage,
-    dsn: str,
-    tmp_path: Path,
+    clock: WrongClock, installation: Installation, dsn: str, tmp_path: Path
 ):
     world = make_flat_world(tmp_path / "world", size=800)
-    me = bearer("register")
-    job = scene_to_register(client, me, storage, dsn, world)(PASSES)
-    brisk = settings.model_copy(update={"lease_seconds": LEASE_S})
-    with running_worker(brisk, tmp_path / "worker.log", **clock.environment):
-        under_way(client, job, me)
+    job = installation.registering(world)(PASSES)
+    with installation.worker(clock.environment, lease_seconds=LEASE_S) as worker:
+        installation.process(job, worker)
         for days in JUMPS_DAYS:
             clock.jump(days)
             before = lease(dsn)
@@ -132,7 +120,7 @@ def test_a_worker_whose_clock_jumps_keeps_its_job(
                 lambda before=before: lease(dsn) != before,
                 "the lease is renewed, or the job has ended",
             )
-        ended_job = ended(client, job, me)
+        ended_job = installation.ended(job)
     assert ended_job["status"] == "successful", ended_job
     with engine.connect(dsn) as connection:
         row = run_sql(connection, "select attempt, failures from job").fetchone()

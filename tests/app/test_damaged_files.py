@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from amers.app.usecases.jobs import do_attempt
 from amers.app.usecases.references import NewReference, add_reference
 from amers.app.usecases.store_verification import Verification, verify_store
 from amers.services.formats.chips.npy_files import read_chip_file
+from tests.app.callers import Bearer
 from tests.app.job_queue import claimed
 from tests.app.s3_server import running_bucket
 from tests.factories import BOX, make_block
@@ -34,7 +35,6 @@ from tests.unproven import unproven_storage
 
 pytestmark = pytest.mark.thorough
 
-Bearer = Callable[[str], dict[str, str]]
 CHIPS = "/collections/points/chips"
 EXPORT = {"inputs": {"bbox": list(BOX)}}
 STORED = {"chips", "scene image", "side file", "upload archive", "result"}

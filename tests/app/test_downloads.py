@@ -3,7 +3,6 @@
 import csv
 import io
 import re
-from collections.abc import Callable
 from email.message import Message
 from urllib.parse import unquote
 from uuid import UUID
@@ -17,10 +16,10 @@ from amers.app.api.disposition import disposition
 from amers.app.db.engine import Database
 from amers.app.db.jobs import attempts
 from amers.app.storage import Storage
+from tests.app.callers import Bearer
 from tests.app.job_queue import claimed
 from tests.statements import run_sql
 
-Bearer = Callable[[str], dict[str, str]]
 TIFF = b"II*\0" + bytes(1000)
 FORMULAS = ["=1+1", "+cmd|' /C calc'!A0", "-2+3", "@SUM(1)", "\tx", "\rx", '="a"', "-", "+1e", "-1-1"]
 PLAIN = ["-5", "+4.5", "-.5e-3", "a=1", "1+1", "", "'", "é", 'say "hi"']

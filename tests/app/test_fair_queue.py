@@ -125,20 +125,20 @@ def test_only_administrators_give_priorities(client: TestClient, bearer):
     )
     body = {"inputs": {"scene": scene.json()["id"]}, "amers:priority": 7}
     execute = "/processes/register-scene/execution"
-    refused = client.post(execute, json=body, headers=me)
+    refused = me.post(execute, json=body)
     assert (refused.status_code, refused.json()["detail"].count("admin")) == (403, 1)
-    job = client.post(execute, json=body, headers=bearer("admin"))
+    job = bearer("admin").post(execute, json=body)
     assert (job.status_code, job.json()["amers:priority"]) == (201, 7)
-    beyond = client.post(execute, json={**body, "amers:priority": 101}, headers=bearer("admin"))
+    beyond = bearer("admin").post(execute, json={**body, "amers:priority": 101})
     assert (beyond.status_code, "amers:priority" in beyond.json()["detail"]) == (422, True)
 
 
 def test_nobody_else_gives_a_priority_below_the_usual_one_either(client: TestClient, bearer):
     execute, me = "/processes/register-scene/execution", bearer("register")
-    scene = client.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100), headers=me).json()["id"]
+    scene = me.scene(b"II*\0" + bytes(100), "name=a.tif")
     for priority, status in ((-1, 403), (0, 201)):
         body = {"inputs": {"scene": scene}, "amers:priority": priority}
-        assert client.post(execute, json=body, headers=me).status_code == status
+        assert me.post(execute, json=body).status_code == status
 
 
 def test_an_owner_at_his_limit_waits_and_others_go_on(connection: Connection):
@@ -423,16 +423,12 @@ def test_a_real_worker_does_the_job_of_another_owner_before_the_rest_of_a_flood(
     jobs_of: dict[str, list[str]] = {}
     for name, count in (("many", 6), ("one", 1)):
         me = bearer("register")
-        scene = client.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100), headers=me).json()["id"]
-        body = {"inputs": {"scene": scene}}
-        made = [
-            client.post("/processes/register-scene/execution", json=body, headers=me)
-            for _ in range(count)
-        ]
+        scene = me.scene(b"II*\0" + bytes(100), "name=a.tif")
+        made = [me.execute("register-scene", {"scene": scene}) for _ in range(count)]
         jobs_of[name] = [str(reply.json()["jobID"]) for reply in made]
     admin = bearer("admin")
     with running_worker(settings, tmp_path / "log"):
         ended(client, f"/jobs/{jobs_of['one'][0]}", admin)
-        states = [client.get(f"/jobs/{job}", headers=admin).json()["status"] for job in jobs_of["many"]]
+        states = [admin.get(f"/jobs/{job}").json()["status"] for job in jobs_of["many"]]
     assert states[0] == "failed", "the oldest job of all came first"
     assert states[2:] == ["accepted"] * 4

@@ -1,7 +1,7 @@
 """Disks that fill up during an upload or an ingestion: a clear error and no partial data."""
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from amers.app.errors import is_no_room
 from amers.app.storage import Storage
 from amers.app.usecases.blocks import lifecycle
 from amers.app.usecases.garbage_collection import Bin, remove_unnamed_chips
+from tests.app.callers import Bearer
 from tests.app.conftest import stored_files
 from tests.app.small_disk import Disk
 from tests.app.worker_processes import ended, running_worker
@@ -31,8 +32,6 @@ TUS = {"Tus-Resumable": "1.0.0"}
 LEASE_S = 0.5
 DATABASE_ROOM = 300 * MEBIBYTE
 """Enough for a database, its log and a block, and little more."""
-
-Bearer = Callable[[str], dict[str, str]]
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
 """Histories of points and views: recorded by registrations, and used for health and suspensions."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from amers.app.cli.main import app as amers
 from amers.app.config import Settings
-from amers.app.db import engine, history, registrations
+from amers.app.db import engine, history
 from amers.app.db.engine import Connection, Database
 from amers.app.db.history import NOT_ATTRIBUTABLE
 from amers.app.db.jobs import attempts, jobs
@@ -40,8 +40,9 @@ from amers.services.formats.block.check import check_block
 from amers.services.registration.on_points import Registration
 from amers.services.registration.options import RegistrationOptions
 from amers.services.types import health
+from tests.app.callers import Bearer
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
-from tests.app.job_queue import claim
+from tests.app.job_queue import claim, store_registration
 from tests.statements import run_sql
 
 VANISHED = 5
@@ -102,16 +103,7 @@ def stored(registered: RegisteredScene, first_id: int) -> Registration:
 
 def remembered(connection: Connection, registration: Registration, scene: str) -> None:
     """Record a registration of a scene of this name."""
-    registration_id = registrations.insert_registration(
-        connection,
-        job_id=None,
-        scene_id=None,
-        block_versions=[],
-        options={},
-        report={},
-        verdict=registration.qualification.verdict,
-        files={},
-    )
+    registration_id = store_registration(connection, verdict=registration.qualification.verdict)
     record_measures(connection, registration_id, registration, scene)
 
 
@@ -485,21 +477,17 @@ def test_the_next_registration_prefers_points_that_have_served(
 
 
 def test_a_failing_point_is_proposed_for_suspension_and_served_until_the_decision(
-    connection: Connection,
-    client: TestClient,
-    bearer: Callable[[str], dict[str, str]],
-    stored: Registration,
-    first_id: int,
+    client: TestClient, connection: Connection, bearer: Bearer, stored: Registration, first_id: int
 ) -> None:
     reader, admin = bearer("read"), bearer("admin")
 
     def proposed() -> list[int]:
         parameters = {"filter": "state = 'proposed'", "limit": 100}
-        page = client.get("/collections/point-history/items", params=parameters, headers=reader).json()
+        page = reader.get("/collections/point-history/items", params=parameters).json()
         return [feature["id"] for feature in page["features"]]
 
     def served() -> set[int]:
-        page = client.get("/collections/points/items?limit=100", headers=reader).json()
+        page = reader.get("/collections/points/items?limit=100").json()
         assert page["numberMatched"] == page["numberReturned"]
         return {feature["id"] for feature in page["features"]}
 
@@ -513,28 +501,28 @@ def test_a_failing_point_is_proposed_for_suspension_and_served_until_the_decisio
 
     bad = first_id
     because = {"because": "a roundabout was built there"}
-    assert client.post(f"/points/{bad}/suspend", json=because, headers=reader).status_code == 403
-    assert client.post("/points/1/suspend", json=because, headers=admin).status_code == 404
-    assert client.post(f"/points/{bad}/suspend", json={"because": " "}, headers=admin).status_code == 422
-    reply = client.post(f"/points/{bad}/suspend", json=because, headers=admin)
+    assert reader.post(f"/points/{bad}/suspend", json=because).status_code == 403
+    assert admin.post("/points/1/suspend", json=because).status_code == 404
+    assert admin.post(f"/points/{bad}/suspend", json={"because": " "}).status_code == 422
+    reply = admin.post(f"/points/{bad}/suspend", json=because)
     assert (reply.status_code, reply.json()["state"]) == (200, "suspended")
-    assert client.post(f"/points/{bad}/suspend", json=because, headers=admin).status_code == 409
+    assert admin.post(f"/points/{bad}/suspend", json=because).status_code == 409
     assert served() == set(range(first_id, first_id + 40)) - {bad}
     assert bad not in proposed()
-    one = client.get(f"/collections/points/items/{bad}", headers=reader).json()["properties"]
+    one = reader.get(f"/collections/points/items/{bad}").json()["properties"]
     assert (one["attempts"], one["successes"], one["last_success"]) == (10, 0, None)
     assert one["suspended_because"] == because["because"]
     assert one["health"] < 0.5
-    good = client.get(f"/collections/points/items/{first_id + 30}", headers=reader).json()["properties"]
+    good = reader.get(f"/collections/points/items/{first_id + 30}").json()["properties"]
     assert (good["attempts"], good["successes"], good["state"], good["health"]) == (10, 10, "served", 1)
     assert 0.0 < good["mean_residual_px"] < 1.0
     assert good["last_success"] is not None
 
-    back = client.post(f"/points/{bad}/reinstate", headers=admin)
+    back = admin.post(f"/points/{bad}/reinstate")
     assert (back.status_code, back.json()["attempts"], back.json()["state"]) == (200, 0, "served")
-    assert client.post(f"/points/{bad}/reinstate", headers=admin).status_code == 409
+    assert admin.post(f"/points/{bad}/reinstate").status_code == 409
     assert bad in served()
-    changes = client.get(f"/audit?kind=point&subject={bad}", headers=admin).json()["changes"]
+    changes = admin.get(f"/audit?kind=point&subject={bad}").json()["changes"]
     assert [change["after"]["suspended_because"] for change in changes] == [None, because["because"]]
     assert {change["actor_name"] for change in changes} == {"a token to admin"}
 

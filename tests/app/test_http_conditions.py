@@ -5,7 +5,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from email import message_from_bytes
 from pathlib import Path
@@ -19,6 +19,7 @@ from fastapi.testclient import TestClient
 
 from amers.app.config import Settings
 from amers.app.main import create_app
+from tests.app.callers import Bearer
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.http_world import TIFF, HttpWorld, headers_of, http_world
 from tests.app.s3_server import running_bucket
@@ -262,7 +263,7 @@ def test_a_file_in_a_bucket_is_sent_like_one_in_a_folder(
     dsn: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    bearer: Callable[[str], dict[str, str]],
+    bearer: Bearer,
 ):
     with running_bucket(monkeypatch) as bucket:
         settings = Settings(database_url=dsn, data_folder=tmp_path / "data", storage_url=bucket)

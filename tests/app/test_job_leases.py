@@ -15,7 +15,15 @@ from amers.app.db.jobs.jobs import Job
 from amers.app.storage import Storage
 from amers.app.worker.attempt import ATTEMPTS_ALLOWED
 from amers.app.worker.sweep import sweep_files, sweep_jobs
-from tests.app.job_queue import LEASE_S, claimed, let_lease_lapse, new_job, state_of, tickets
+from tests.app.job_queue import (
+    LEASE_S,
+    claimed,
+    let_lease_lapse,
+    new_job,
+    state_of,
+    store_registration,
+    tickets,
+)
 from tests.statements import run_sql
 
 
@@ -74,16 +82,7 @@ def test_a_worker_back_from_the_dead_writes_nothing(database: Database):
 
 def finish(connection: Connection, job_id: UUID, attempt: int, scene_id: UUID) -> None:
     """Write a result and end the job, as a worker does."""
-    registrations.insert_registration(
-        connection,
-        job_id=job_id,
-        scene_id=scene_id,
-        block_versions=[],
-        options={},
-        report={},
-        verdict="good",
-        files={},
-    )
+    store_registration(connection, job_id=job_id, scene_id=scene_id)
     attempts.succeed(connection, job_id, attempt, {})
 
 

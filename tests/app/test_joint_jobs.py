@@ -23,6 +23,7 @@ from amers.services.formats.vector.layers import read_layer
 from amers.services.map_grid import xy_of_lon_lat
 from amers.services.reports.document import failure_schema
 from amers.services.types import Frame
+from tests.app.callers import Bearer
 from tests.app.flat_world import (
     CENTRE,
     GROUND_H,
@@ -105,7 +106,7 @@ class Caller:
 @pytest.fixture
 def me(
     client: TestClient,
-    bearer: Callable[[str], Headers],
+    bearer: Bearer,
     database: Database,
     settings: Settings,
     world: FlatWorld,
@@ -119,7 +120,7 @@ def me(
 
 
 @pytest.fixture
-def stranger(me: Caller, bearer: Callable[[str], Headers]) -> Caller:
+def stranger(me: Caller, bearer: Bearer) -> Caller:
     return Caller(me.client, make_token(me.client, bearer("admin")), me.run)
 
 
@@ -140,7 +141,7 @@ def write_terrain(path: Path) -> Path:
 
 def test_a_job_registers_uploaded_scenes_together(
     client: TestClient,
-    bearer: Callable[[str], Headers],
+    bearer: Bearer,
     settings: Settings,
     me: Caller,
     scenes: dict[str, str],
@@ -193,7 +194,7 @@ def test_a_job_registers_uploaded_scenes_together(
 def test_a_registration_is_used_by_its_job_and_its_scene(
     me: Caller,
     stranger: Caller,
-    bearer: Callable[[str], Headers],
+    bearer: Bearer,
     scenes: dict[str, str],
     world: FlatWorld,
     folder: Path,

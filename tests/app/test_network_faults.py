@@ -5,28 +5,21 @@ import shutil
 import socket
 import subprocess
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from uuid import uuid4
 
 import pytest
-from fastapi.testclient import TestClient
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 from pydantic import SecretStr
 
-from amers.app.config import Settings
 from amers.app.db import engine
-from amers.app.storage import Storage
 from tests.app.flat_world import make_flat_world
+from tests.app.installation import Installation, Worker
 from tests.app.worker_processes import (
     alive,
-    attempts_of,
-    ended,
-    running_worker,
-    scene_to_register,
-    under_way,
     wait_until,
 )
 from tests.statements import run_sql
@@ -35,8 +28,6 @@ pytestmark = [pytest.mark.long, pytest.mark.endurance]
 
 LEASE_S = 3.0
 PIECE_BYTES = 65_536
-
-Bearer = Callable[[str], dict[str, str]]
 
 
 @dataclass(frozen=True)
@@ -131,40 +122,37 @@ def _relay(here: socket.socket, there: socket.socket) -> None:
 def test_a_worker_that_is_cut_off_loses_its_job_to_another_and_works_again_once_it_is_back(
     machines: tuple[Machine, Machine],
     reached: tuple[str, str],
-    settings: Settings,
-    client: TestClient,
-    bearer: Bearer,
-    storage: Storage,
-    dsn: str,
+    installation: Installation,
     tmp_path: Path,
 ):
     world = make_flat_world(tmp_path / "world", size=800)
-    me = bearer("register")
-    ask = scene_to_register(client, me, storage, dsn, world)
+    ask = installation.registering(world)
 
-    def by(address: str) -> Settings:
-        return settings.model_copy(update={"database_url": SecretStr(address), "lease_seconds": LEASE_S})
+    def worker_on(machine: Machine, address: str) -> Worker:
+        database = SecretStr(address)
+        return installation.worker({}, *machine.enter, database_url=database, lease_seconds=LEASE_S)
 
     lost, other = machines
     job = ask(40)
-    with running_worker(by(reached[0]), tmp_path / "lost.log", *lost.enter) as worker:
-        under_way(client, job, me)
-        (process,) = attempts_of(worker)
+    with worker_on(lost, reached[0]) as worker:
+        process = installation.process(job, worker)
         lost.line("down")
-        with running_worker(by(reached[1]), tmp_path / "other.log", *other.enter):
-            ended_job = ended(client, job, me)
+        with worker_on(other, reached[1]):
+            ended_job = installation.ended(job)
         assert ended_job["status"] == "successful", ended_job
         lost.line("up")
         wait_until(lambda: not alive(process), "the process of the lost attempt ends")
-        again = ended(client, ask(1), me)
+        again = installation.ended(ask(1))
         assert again["status"] == "successful", "the worker that was cut off is back at work"
         assert worker.poll() is None
-    assert client.get(job, headers=me).json() == ended_job, "what came late changed nothing"
-    with engine.connect(dsn) as connection:
+    assert installation.me.get(job).json() == ended_job, "what came late changed nothing"
+    with engine.connect(installation.dsn) as connection:
         rows = run_sql(
             connection,
             "select attempt, (select count(*) from registration r where r.job_id = j.id) as results"
             " from job j order by created_at",
         ).fetchall()
     assert [(row["attempt"], row["results"]) for row in rows] == [(2, 1), (1, 1)]
-    assert {key.split("/")[2] for key in storage.keys(f"results/{ended_job['jobID']}")} == {"2"}
+    assert {key.split("/")[2] for key in installation.storage.keys(f"results/{ended_job['jobID']}")} == {
+        "2"
+    }

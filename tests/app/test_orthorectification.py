@@ -1,7 +1,6 @@
 """Orthorectification of scenes on the command line and by a service."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from uuid import UUID
@@ -18,7 +17,7 @@ from typer.testing import CliRunner
 
 from amers.app.cli.main import app
 from amers.app.config import Settings
-from amers.app.db import engine, registrations, scenes
+from amers.app.db import engine, scenes
 from amers.app.db.engine import Database
 from amers.app.db.jobs import jobs
 from amers.app.errors import AmersError
@@ -29,7 +28,8 @@ from amers.services.formats.sensor_models.rpc_text import format_rpc_text, parse
 from amers.services.geodesy import metres_per_degree
 from amers.services.sensors.rpc import RpcModel
 from amers.services.types import Acquisition
-from tests.app.job_queue import claim
+from tests.app.callers import Bearer
+from tests.app.job_queue import claim, store_registration
 from tests.app.ledger import job_runner, make_token
 
 MODEL = parse_rpc_text((Path(__file__).parents[1] / "golden" / "invented_RPC.TXT").read_text())
@@ -121,32 +121,26 @@ def test_heights_without_a_datum_and_outputs_over_inputs_are_refused(tmp_path: P
 
 
 def test_a_service_rectifies_a_scene_on_a_terrain_uploaded_beside_it(
-    client: TestClient,
-    bearer: Callable[[str], dict[str, str]],
-    settings: Settings,
-    storage: Storage,
-    dsn: str,
-    tmp_path: Path,
+    client: TestClient, bearer: Bearer, settings: Settings, storage: Storage, dsn: str, tmp_path: Path
 ) -> None:
     image, dem = write_inputs(tmp_path)
     me = bearer("register")
-    scene = client.post("/scenes?name=scene.tif", content=image.read_bytes(), headers=me).json()["id"]
-    laid = client.put(f"/scenes/{scene}/files/dem.tif", content=dem.read_bytes(), headers=me)
+    scene = me.scene(image.read_bytes())
+    laid = me.put(f"/scenes/{scene}/files/dem.tif", content=dem.read_bytes())
     assert laid.status_code == 200, laid.text
 
     def outcome(**more_inputs: object) -> dict:
-        body = {"inputs": {"scene": scene, "dem": "dem.tif", **more_inputs}}
-        reply = client.post("/processes/orthorectify/execution", json=body, headers=me)
+        reply = me.execute("orthorectify", {"scene": scene, "dem": "dem.tif", **more_inputs})
         assert reply.status_code == 201, reply.text
         job_id = reply.json()["jobID"]
         with engine.pooled(dsn, settings) as database:
             with database.transaction() as connection:
                 assert claim(connection, UUID(job_id), "a worker", 30.0)
             do_attempt(database, settings, UUID(job_id), 1)
-        job: dict = client.get(f"/jobs/{job_id}", headers=me).json()
+        job: dict = me.get(f"/jobs/{job_id}").json()
         if job["status"] == "failed":
             return job
-        job_results: dict = client.get(f"/jobs/{job_id}/results", headers=me).json()
+        job_results: dict = me.get(f"/jobs/{job_id}/results").json()
         return job_results
 
     unsaid = outcome()
@@ -154,7 +148,7 @@ def test_a_service_rectifies_a_scene_on_a_terrain_uploaded_beside_it(
     assert "dem.tif" in unsaid["error"]["detail"]
     results = outcome(vertical="ellipsoid")
     assert results["error_px"] < 0.1
-    served = client.get(results["ortho.tif"]["href"], headers=me)
+    served = me.get(results["ortho.tif"]["href"])
     assert served.headers["content-type"].startswith("image/tiff")
     (tmp_path / "served.tif").write_bytes(served.content)
     ortho(image, "--dem", dem, "--vertical", "ellipsoid", "-o", tmp_path / "own.tif")
@@ -166,19 +160,10 @@ def test_a_service_rectifies_a_scene_on_a_terrain_uploaded_beside_it(
     with engine.connect(dsn) as connection:
         job = jobs.create(connection, "register-scene", {})
         assert job is not None
-        registrations.insert_registration(
-            connection,
-            job_id=job.id,
-            scene_id=UUID(scene),
-            block_versions=[],
-            options={},
-            report={},
-            verdict="good",
-            files={"refined_RPC.TXT": key},
+        store_registration(
+            connection, job_id=job.id, scene_id=UUID(scene), files={"refined_RPC.TXT": key}
         )
-    refined = client.get(
-        outcome(vertical="ellipsoid", registration=str(job.id))["ortho.tif"]["href"], headers=me
-    )
+    refined = me.get(outcome(vertical="ellipsoid", registration=str(job.id))["ortho.tif"]["href"])
     (tmp_path / "refined.tif").write_bytes(refined.content)
     words = ["--dem", dem, "--vertical", "ellipsoid", "--model", tmp_path / "refined_RPC.TXT"]
     ortho(image, *words, "-o", tmp_path / "own_refined.tif")
@@ -190,7 +175,7 @@ def test_a_service_rectifies_a_scene_on_a_terrain_uploaded_beside_it(
         np.testing.assert_array_equal(ours.read(), own.read())
         assert ours.transform != before.transform
     unknown = {"scene": scene, "dem": "dem.tif", "registration": str(UUID(int=1))}
-    refused = client.post("/processes/orthorectify/execution", json={"inputs": unknown}, headers=me)
+    refused = me.execute("orthorectify", unknown)
     assert refused.status_code == 422
     assert "did not register scene" in refused.json()["detail"]
 
@@ -210,7 +195,7 @@ def test_a_job_makes_no_map_that_its_scene_and_quota_do_not_warrant(
     error: str,
     named: str,
     client: TestClient,
-    bearer: Callable[[str], dict[str, str]],
+    bearer: Bearer,
     settings: Settings,
     storage: Storage,
     database: Database,
@@ -218,8 +203,8 @@ def test_a_job_makes_no_map_that_its_scene_and_quota_do_not_warrant(
 ) -> None:
     image, dem = write_inputs(tmp_path)
     me = make_token(client, bearer("admin"), storage_quota_bytes=quota_bytes)
-    scene = client.post("/scenes?name=scene.tif", content=image.read_bytes(), headers=me).json()["id"]
-    client.put(f"/scenes/{scene}/files/dem.tif", content=dem.read_bytes(), headers=me)
+    scene = me.scene(image.read_bytes())
+    me.put(f"/scenes/{scene}/files/dem.tif", content=dem.read_bytes())
     run = job_runner(client, database, settings, me)
     job = run("orthorectify", scene=scene, dem="dem.tif", vertical="ellipsoid", map=ortho_map)
     assert (job["status"], job["error"]["error"]) == ("failed", error), job
@@ -228,16 +213,16 @@ def test_a_job_makes_no_map_that_its_scene_and_quota_do_not_warrant(
 
 
 def test_a_map_finer_than_its_scene_is_refused_at_the_request_once_the_scene_is_known(
-    client: TestClient, bearer: Callable[[str], dict[str, str]], dsn: str, tmp_path: Path
+    client: TestClient, bearer: Bearer, dsn: str, tmp_path: Path
 ) -> None:
     me = bearer("register")
-    scene = client.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100), headers=me).json()["id"]
+    scene = me.scene(b"II*\0" + bytes(100), "name=a.tif")
     with engine.connect(dsn) as connection:
         scenes.describe(connection, UUID(scene), Acquisition("a"), (300, 400), 0.5)
     statuses = []
     for gsd_m in (0.2, 0.25):
         inputs = {"scene": scene, "dem": "dem.tif", "map": {"gsd_m": gsd_m}}
-        reply = client.post("/processes/orthorectify/execution", json={"inputs": inputs}, headers=me)
+        reply = me.execute("orthorectify", inputs)
         statuses.append(reply.status_code)
     assert statuses == [422, 201]
 

@@ -8,7 +8,7 @@ import logging
 import re
 import shutil
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -25,6 +25,7 @@ from amers.app.public_url import FOLDERS, LEAVES, normal_public_url
 from amers.app.storage import Storage
 from amers.app.usecases.blocks import lifecycle
 from amers.app.web import page
+from tests.app.callers import Bearer
 from tests.app.ledger import job_runner
 from tests.factories import make_block
 from tests.links import POST_ALONE, kind_of, urls_of
@@ -35,8 +36,6 @@ TIFF = b"II*\0" + bytes(100)
 TUS = {"Tus-Resumable": "1.0.0", "Upload-Length": "10", "Upload-Metadata": "filename YS50aWY="}
 BOX = [5.2, 43.2, 5.3, 43.3]
 most_replies = 1000
-
-Bearer = Callable[[str], dict[str, str]]
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 """Reference images of a service: added, used where there are no points, and their recorded places."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from uuid import UUID
@@ -36,6 +36,7 @@ from amers.services.imagery.source import ArrayImage, sample_image
 from amers.services.map_grid import MapGrid, xy_of_lon_lat
 from amers.services.registration.options import RegistrationOptions
 from amers.services.types import FloatImage
+from tests.app.callers import Bearer
 from tests.app.job_queue import claim
 from tests.app.s3_server import running_bucket
 from tests.app.worker_processes import ended, running_worker
@@ -220,7 +221,7 @@ def test_a_scene_outside_every_reference_is_refused_with_the_reason(
 def test_a_service_registers_on_a_reference_where_it_has_no_points_or_when_asked(
     settings: Settings,
     database: Database,
-    bearer: Callable[[str], dict[str, str]],
+    bearer: Bearer,
     folder: Path,
 ) -> None:
     admin, me = bearer("admin"), bearer("register")
@@ -267,7 +268,7 @@ def test_a_service_registers_on_a_reference_where_it_has_no_points_or_when_asked
 
 def test_a_service_whose_files_are_in_a_bucket_registers_on_a_reference(
     settings: Settings,
-    bearer: Callable[[str], dict[str, str]],
+    bearer: Bearer,
     folder: Path,
     dsn: str,
     tmp_path: Path,

@@ -1,7 +1,6 @@
 """`amers scene register`: on a block folder, on the store, and by a remote service."""
 
 import json
-import os
 import re
 import shlex
 from collections.abc import Callable
@@ -30,7 +29,7 @@ from tests.app.registration_outputs import (
     write_mask,
 )
 from tests.app.running_service import running_service
-from tests.command_line import Done, amers_here, amers_process
+from tests.command_line import Done, amers_here, amers_process, environment_of
 from tests.statements import run_sql
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
@@ -53,11 +52,7 @@ def published(world: FlatWorld, dsn: str, storage: Storage) -> None:
 @pytest.fixture
 def environment(settings: Settings) -> dict[str, str]:
     """Variables that name the installation of the test."""
-    assert settings.database_url is not None
-    return os.environ | {
-        "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
-        "AMERS_DATA_FOLDER": str(settings.data_folder),
-    }
+    return environment_of(settings)
 
 
 @pytest.fixture

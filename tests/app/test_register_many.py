@@ -23,7 +23,7 @@ from tests.app.joint_world import (
     write_scenes,
 )
 from tests.app.registration_outputs import largest_error_px
-from tests.command_line import Done, amers_here
+from tests.command_line import Done, amers_here, environment_of
 from tests.statements import run_sql
 
 pytestmark = pytest.mark.long
@@ -44,11 +44,7 @@ def folder(world: FlatWorld, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def amers(settings: Settings) -> Amers:
-    assert settings.database_url is not None
-    environment = os.environ | {
-        "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
-        "AMERS_DATA_FOLDER": str(settings.data_folder),
-    }
+    environment = environment_of(settings)
     return lambda *words: amers_here(words, environment)
 
 

@@ -2,7 +2,6 @@
 
 import json
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,6 +26,7 @@ from amers.services.sensors.pushbroom import PushbroomModel
 from amers.services.sensors.pushbroom_errors import TERMS, PushbroomErrors
 from amers.services.simulation.orbit import pushbroom_over
 from amers.services.types import Array
+from tests.app.callers import Bearer
 from tests.app.flat_world import (
     CENTRE,
     GROUND_H,
@@ -237,7 +237,7 @@ def test_what_cannot_be_done_is_said(world: FlatWorld, folder: Path, tmp_path: P
 
 def test_a_job_adjusts_the_orbits_of_uploaded_scenes(
     client: TestClient,
-    bearer: Callable[[str], dict[str, str]],
+    bearer: Bearer,
     settings: Settings,
     world: FlatWorld,
     folder: Path,

@@ -1,7 +1,6 @@
 """From an image and a block to a refined model: over HTTP with a worker, and by the use case."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from uuid import UUID
@@ -23,6 +22,7 @@ from amers.app.usecases.retention import remove_old_results
 from amers.services.formats.sensor_models.rpc_files import read_rpc
 from amers.services.sensors.correction import CorrectedModel, no_correction
 from amers.services.sensors.refined import refined_rpc
+from tests.app.callers import Bearer
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
 from tests.app.registration_outputs import (
     A_TENTH_OF_A_PIXEL,
@@ -38,8 +38,6 @@ from tests.app.worker_processes import ended, running_worker
 from tests.statements import run_sql
 
 pytestmark = pytest.mark.thorough
-
-Bearer = Callable[[str], dict[str, str]]
 
 
 @pytest.fixture(scope="module")
@@ -83,16 +81,14 @@ def test_a_scene_goes_from_upload_to_a_refined_model_by_http(
     dsn: str,
 ):
     me = bearer("register")
-    upload = client.post(
-        f"/scenes?name=scene.tif&sigma_m={SIGMA_M}", content=world.image.read_bytes(), headers=me
-    )
+    upload = me.post(f"/scenes?name=scene.tif&sigma_m={SIGMA_M}", content=world.image.read_bytes())
     scene = upload.json()["id"]
     write_check_points(tmp_path / "checks.geojson", world)
     write_mask(tmp_path / "mask.tif")
     for path in (world.rpc_text, tmp_path / "checks.geojson", tmp_path / "mask.tif"):
-        laid = client.put(f"/scenes/{scene}/files/{path.name}", content=path.read_bytes(), headers=me)
+        laid = me.put(f"/scenes/{scene}/files/{path.name}", content=path.read_bytes())
         assert laid.status_code == 200, laid.text
-    assert client.put(f"/scenes/{scene}/files/a.exe", content=b"MZ", headers=me).status_code == 422
+    assert me.put(f"/scenes/{scene}/files/a.exe", content=b"MZ").status_code == 422
     inputs = {
         "scene": scene,
         "bands": "1",
@@ -103,13 +99,12 @@ def test_a_scene_goes_from_upload_to_a_refined_model_by_http(
     }
     wrong = {"inputs": {**inputs, "bands": "zero"}}
     execution = "/processes/register-scene/execution"
-    assert client.post(execution, json=wrong, headers=me).status_code == 422
-    body = {"inputs": inputs}
-    response = client.post("/processes/register-scene/execution", json=body, headers=me)
+    assert me.post(execution, json=wrong).status_code == 422
+    response = me.execute("register-scene", inputs)
     with running_worker(settings, tmp_path / "log"):
         ended_job = ended(client, response.headers["location"], me)
     assert (ended_job["status"], ended_job["progress"]) == ("successful", 100), ended_job
-    results = client.get(f"/jobs/{ended_job['jobID']}/results", headers=me).json()
+    results = me.get(f"/jobs/{ended_job['jobID']}/results").json()
     assert results.pop("verdict") in ("good", "usable")
     assert results.pop("method") == "control points"
     assert results.pop("verdict_scope") == "relative to the control points"
@@ -119,16 +114,16 @@ def test_a_scene_goes_from_upload_to_a_refined_model_by_http(
     folder = tmp_path / "downloaded"
     folder.mkdir()
     for name, link in results.items():
-        reply = client.get(link["href"], headers=me)
+        reply = me.get(link["href"])
         assert reply.headers["content-type"].startswith(link["type"])
         (folder / name).write_bytes(reply.content)
-        assert client.get(link["href"], headers=bearer("register")).status_code == 404
+        assert bearer("register").get(link["href"]).status_code == 404
     assert_registered(folder, world)
-    page = client.get(results["report.html"]["href"], headers=me)
+    page = me.get(results["report.html"]["href"])
     assert "default-src 'none'" in page.headers["content-security-policy"]
     for name in ("..%2Freport.json", "nothing.json", "%2e%2e"):
-        assert client.get(f"/jobs/{ended_job['jobID']}/results/{name}", headers=me).status_code == 404
-    assert client.get(f"/scenes/{scene}", headers=me).json()["footprint"]["type"] == "Polygon"
+        assert me.get(f"/jobs/{ended_job['jobID']}/results/{name}").status_code == 404
+    assert me.get(f"/scenes/{scene}").json()["footprint"]["type"] == "Polygon"
     assert largest_error_px(read_rpc(folder / "scene.tif").model, world.true_model) < A_TENTH_OF_A_PIXEL
     report = json.loads((folder / "report.json").read_text())
     # No point tells how the image is bent beneath the mask, over its first lines.
@@ -164,47 +159,42 @@ def test_a_job_that_finds_no_consensus_keeps_the_report_of_its_failure(
     me = bearer("register")
     # The points lie 8 m from where a model with a stated accuracy of 0.1 m expects them.
     image = world.tagged.read_bytes()
-    scene = client.post(f"/scenes?name=scene.tif&sigma_m={SIGMA_M}", content=image, headers=me).json()[
-        "id"
-    ]
+    scene = me.scene(image, f"name=scene.tif&sigma_m={SIGMA_M}")
     body = {"inputs": {"scene": scene, "sigma_m": 0.1}}
     for unusable in (0, -1):
-        wrong = {"inputs": body["inputs"] | {"sigma_m": unusable}}
-        assert (
-            client.post("/processes/register-scene/execution", json=wrong, headers=me).status_code == 422
-        )
-    assert client.get(f"/scenes/{scene}", headers=me).json()["registrations"] == []
-    asked = client.post("/processes/register-scene/execution", json=body, headers=me)
+        assert me.execute("register-scene", body["inputs"] | {"sigma_m": unusable}).status_code == 422
+    assert me.get(f"/scenes/{scene}").json()["registrations"] == []
+    asked = me.post("/processes/register-scene/execution", json=body)
     with running_worker(settings, tmp_path / "log"):
         job = ended(client, asked.headers["location"], me)
     assert (job["status"], job.get("amers:verdict")) == ("failed", "not registered"), job
-    assert client.get(f"/jobs/{job['jobID']}/results", headers=me).status_code == 409
+    assert me.get(f"/jobs/{job['jobID']}/results").status_code == 409
     links = {link["title"]: link for link in job["links"] if "/results/" in link["href"]}
     assert set(links) == {"report.json", "report.html", "report.txt"}
-    report = client.get(links["report.json"]["href"], headers=me).json()
+    report = me.get(links["report.json"]["href"]).json()
     validate(report, client.get("/schemas/failure.json").json())
     assert (report["scene"]["name"], report["visible"]) == ("scene", 40)
     assert report["search_stages"][-1]["tried"] == 40
     assert "--sigma-m" in report["next_steps"][0]["command"]
-    page = client.get(links["report.html"]["href"], headers=me)
+    page = me.get(links["report.html"]["href"])
     assert page.headers["content-type"].startswith("text/html")
     for text in (json.dumps(report), page.text):
         assert str(tmp_path) not in text
         assert "/tmp/" not in text
-    assert client.get(links["report.html"]["href"], headers=bearer("register")).status_code == 404
-    (listed,) = client.get("/jobs", headers=me).json()["jobs"]
+    assert bearer("register").get(links["report.html"]["href"]).status_code == 404
+    (listed,) = me.get("/jobs").json()["jobs"]
     assert listed["amers:verdict"] == "not registered"
-    (one,) = client.get(f"/scenes/{scene}", headers=me).json()["registrations"]
+    (one,) = me.get(f"/scenes/{scene}").json()["registrations"]
     assert (one["job"], one["outcome"], one["verdict"]) == (job["jobID"], "failed", "not registered")
-    assert client.get("/scenes", headers=bearer("register")).json()["scenes"] == []
-    metrics = client.get("/metrics", headers=bearer("admin")).text
+    assert bearer("register").get("/scenes").json()["scenes"] == []
+    metrics = bearer("admin").get("/metrics").text
     assert 'amers_registration_jobs{verdict="not registered"} 1.0' in metrics
     # The files belong to the job: sweeps keep them, and retention removes them.
     reconcile_results(database, storage)
     folder = f"results/{job['jobID']}"
     sizes = storage.sizes(folder)
     assert len(sizes) == 3
-    owner = UUID(client.get("/tokens/self", headers=me).json()["id"])
+    owner = UUID(me.get("/tokens/self").json()["id"])
     with database.transaction() as connection:
         assert read_usage(connection, owner).result_bytes == sum(sizes.values()), "of the owner's quota"
         run_sql(connection, "update job set finished_at = finished_at - interval '2 days'")
@@ -213,8 +203,8 @@ def test_a_job_that_finds_no_consensus_keeps_the_report_of_its_failure(
     assert storage.keys(folder) == []
     with database.transaction() as connection:
         assert read_usage(connection, owner).result_bytes == 0
-    assert client.get(links["report.html"]["href"], headers=me).status_code == 404
-    gone = client.get(f"/jobs/{job['jobID']}", headers=me).json()
+    assert me.get(links["report.html"]["href"]).status_code == 404
+    gone = me.get(f"/jobs/{job['jobID']}").json()
     assert not [link for link in gone["links"] if "/results/" in link["href"]]
 
 
@@ -228,14 +218,10 @@ def test_a_job_whose_verdict_is_failed_says_so_in_every_list(
 ):
     me = bearer("register")
     image = world.tagged.read_bytes()
-    scene = client.post(f"/scenes?name=scene.tif&sigma_m={SIGMA_M}", content=image, headers=me).json()[
-        "id"
-    ]
+    scene = me.scene(image, f"name=scene.tif&sigma_m={SIGMA_M}")
     strict = {"options": {"qualification": {"usable_active_points": 1000}}}
     asked = [
-        client.post(
-            "/processes/register-scene/execution", json={"inputs": {"scene": scene, **more}}, headers=me
-        ).headers["location"]
+        me.execute("register-scene", {"scene": scene, **more}).headers["location"]
         for more in (strict, {})
     ]
     with running_worker(settings, tmp_path / "log"):
@@ -244,16 +230,16 @@ def test_a_job_whose_verdict_is_failed_says_so_in_every_list(
     assert (failed["amers:verdict"], done["amers:verdict"]) in (("failed", "good"), ("failed", "usable"))
     assert failed["message"] == "done, verdict failed: do not use the refined model"
     assert done["message"] == f"done, verdict {done['amers:verdict']}"
-    listed = client.get("/jobs", headers=me).json()["jobs"]
+    listed = me.get("/jobs").json()["jobs"]
     assert {job["jobID"]: job["amers:verdict"] for job in listed} == {
         job["jobID"]: job["amers:verdict"] for job in (failed, done)
     }
     assert [job["amers:sceneNames"] for job in listed] == [["scene.tif"]] * 2
-    (newest,) = client.get("/scenes", headers=me).json()["scenes"][0]["registrations"]
+    (newest,) = me.get("/scenes").json()["scenes"][0]["registrations"]
     assert (newest["job"], newest["outcome"]) == (done["jobID"], "registered")
     for name in ("relative_to_control_points", "on_the_earth"):
         assert newest[name] == done[f"amers:{name}"]
-    both = client.get(f"/scenes/{scene}", headers=me).json()["registrations"]
+    both = me.get(f"/scenes/{scene}").json()["registrations"]
     assert [(one["outcome"], one["verdict"]) for one in both] == [
         ("registered", done["amers:verdict"]),
         ("failed", "failed"),
@@ -271,16 +257,16 @@ def test_a_block_is_ingested_by_a_job_of_an_administrator(
     monkeypatch.setenv("AMERS_INGEST_FOLDER", str(world.block.parent))
     execution, admin = "/processes/ingest-block/execution", bearer("admin")
     body = {"inputs": {"path": "block", "publish": True}}
-    assert client.post(execution, json=body, headers=bearer("register")).status_code == 403
-    first = client.post(execution, json=body, headers=admin).headers["location"]
-    again = client.post(execution, json=body, headers=admin).headers["location"]
+    assert bearer("register").post(execution, json=body).status_code == 403
+    first = admin.post(execution, json=body).headers["location"]
+    again = admin.post(execution, json=body).headers["location"]
     bad = {"inputs": {"path": "../world0"}}
-    outside = client.post(execution, json=bad, headers=admin).headers["location"]
+    outside = admin.post(execution, json=bad).headers["location"]
     with running_worker(settings, tmp_path / "log"):
         ended_jobs = [ended(client, job, admin) for job in (first, again, outside)]
     assert [job["status"] for job in ended_jobs] == ["successful", "failed", "failed"]
     assert [job.get("error", {}).get("error") for job in ended_jobs] == [None, "Conflict", "InputError"]
-    results = client.get(f"{first}/results", headers=admin).json()
+    results = admin.get(f"{first}/results").json()
     assert (results["id"], results["state"], results["points"]) == ("flat", "published", 40)
 
 

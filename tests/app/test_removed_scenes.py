@@ -1,6 +1,5 @@
 """A scene that its owner removes while a job reads it: the job says so, whatever broke by that."""
 
-from collections.abc import Callable
 from pathlib import Path
 from uuid import UUID
 
@@ -14,6 +13,7 @@ from amers.app.db.engine import Database
 from amers.app.usecases import scene_view
 from amers.app.usecases.jobs import do_attempt
 from amers.app.usecases.registration import job as registration_job
+from tests.app.callers import Bearer
 from tests.app.job_queue import claimed, state_of
 
 
@@ -28,7 +28,7 @@ from tests.app.job_queue import claimed, state_of
 )
 def test_a_job_whose_scene_is_removed_names_the_scene(
     client: TestClient,
-    bearer: Callable[[str], dict[str, str]],
+    bearer: Bearer,
     settings: Settings,
     database: Database,
     tmp_path: Path,

@@ -40,6 +40,7 @@ from amers.app.usecases.registration.register import (
 )
 from amers.services.registration.options import RegistrationOptions
 from amers.services.types import Measures, point_chips
+from tests.app.callers import Bearer
 from tests.app.conftest import stored_files
 from tests.app.flat_world import SIGMA_M, publish_world
 from tests.app.ledger import job_runner
@@ -155,7 +156,7 @@ def test_a_later_scene_of_the_season_matches_better_and_nothing_has_moved(
     storage: Storage,
     dsn: str,
     client: TestClient,
-    bearer: Callable[[str], dict[str, str]],
+    bearer: Bearer,
     command: Callable[..., Any],
     tmp_path: Path,
 ) -> None:
@@ -392,7 +393,7 @@ def test_an_administrator_renews_a_block_by_a_job(
     scenes: Scenes,
     published: None,
     client: TestClient,
-    bearer: Callable[[str], dict[str, str]],
+    bearer: Bearer,
     database: Database,
     settings: Settings,
     storage: Storage,

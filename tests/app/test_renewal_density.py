@@ -22,6 +22,7 @@ from amers.services.formats.block.writer import write_block
 from amers.services.formats.images.raster import write_raster
 from amers.services.geodesy import east_north_up
 from amers.services.types import Array, ControlPoints, point_chips
+from tests.app.callers import Bearer
 from tests.app.ledger import job_runner
 from tests.factories import metadata
 from tests.services.block_with_hole import HOLE_M, PER_KM2, SIGMA_M, older, simulated
@@ -80,7 +81,7 @@ class Holed:
 def holed(
     dsn: str,
     client: TestClient,
-    bearer: Callable[[str], dict[str, str]],
+    bearer: Bearer,
     database: Database,
     settings: Settings,
     storage: Storage,

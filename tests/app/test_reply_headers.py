@@ -1,6 +1,6 @@
 """Headers of replies, names of the service in `Host`, and what tus demands of every reply."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -8,14 +8,13 @@ from fastapi.testclient import TestClient
 
 from amers.app.config import Settings
 from amers.app.main import create_app
+from tests.app.callers import Bearer
 
 pytestmark = pytest.mark.security
 
 TIFF = b"II*\0" + bytes(100)
 TUS = {"Tus-Resumable": "1.0.0"}
 PIECE = {"Content-Type": "application/offset+octet-stream"}
-
-Bearer = Callable[[str], dict[str, str]]
 
 
 def operations(client: TestClient) -> Iterator[tuple[str, str]]:

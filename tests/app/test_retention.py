@@ -6,7 +6,6 @@ import psycopg
 import pytest
 
 from amers.app.config import Settings, read_settings
-from amers.app.db import registrations
 from amers.app.db.audit import list_changes
 from amers.app.db.engine import Connection, Database
 from amers.app.db.jobs import attempts, jobs
@@ -16,7 +15,7 @@ from amers.app.storage import Storage
 from amers.app.usecases.results import result_key
 from amers.app.usecases.tokens import create_token
 from amers.app.worker.sweep import sweep_files, sweep_records
-from tests.app.job_queue import claim
+from tests.app.job_queue import claim, store_registration
 from tests.statements import run_sql
 
 OLDER = (
@@ -54,15 +53,8 @@ def successful_job(database: Database, storage: Storage) -> UUID:
     """A registration job with a file of 100 bytes."""
     with database.transaction() as connection:
         job_id, key = running_job(connection, storage)
-        registrations.insert_registration(
-            connection,
-            job_id=job_id,
-            scene_id=None,
-            block_versions=[],
-            options={},
-            report={"verdict": "good"},
-            verdict="good",
-            files={"report.json": key},
+        store_registration(
+            connection, job_id=job_id, report={"verdict": "good"}, files={"report.json": key}
         )
         attempts.succeed(connection, job_id, 1, {"files": {"report.json": key}})
     return job_id

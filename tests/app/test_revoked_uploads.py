@@ -1,7 +1,7 @@
 """A token that is revoked while its owner sends a file: the upload ends, and nothing is acknowledged."""
 
 from base64 import b64encode
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,6 +11,7 @@ from fastapi.testclient import TestClient
 from amers.app.api import sent_body
 from amers.app.api.body import body_chunks
 from amers.app.storage import Storage
+from tests.app.callers import Bearer
 from tests.app.conftest import stored_files
 from tests.statements import run_sql
 
@@ -41,7 +42,7 @@ def ending(request: pytest.FixtureRequest, connection, monkeypatch) -> list[int]
 @pytest.mark.parametrize("check_s", [0.0, 3600.0], ids=["while it arrives", "when all has arrived"])
 def test_an_upload_ends_with_the_token(
     client: TestClient,
-    bearer: Callable[[str], dict[str, str]],
+    bearer: Bearer,
     storage: Storage,
     ending: list[int],
     monkeypatch: pytest.MonkeyPatch,
@@ -57,7 +58,7 @@ def test_an_upload_ends_with_the_token(
 @pytest.mark.parametrize("check_s", [0.0, 3600.0], ids=["while it arrives", "when all has arrived"])
 def test_a_resumable_upload_ends_with_the_token(
     client: TestClient,
-    bearer: Callable[[str], dict[str, str]],
+    bearer: Bearer,
     connection,
     ending: list[int],
     monkeypatch: pytest.MonkeyPatch,

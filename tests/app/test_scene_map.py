@@ -24,6 +24,7 @@ from amers.services.formats.sensor_models.correction_json import format_correcti
 from amers.services.orthorectification.tile_limits import TILE_PX, TileLimits
 from amers.services.sensors.correction import no_correction
 from amers.services.types import Array
+from tests.app.callers import Bearer, Caller
 from tests.app.flat_world import (
     CENTRE,
     GROUND_H,
@@ -43,7 +44,6 @@ a_quarter_of_a_pixel_m = 0.11
 """Of the finest tiles, on the ground."""
 largest_tile_bytes = 8 * TILE_PX**2
 Run = Callable[..., dict]
-Bearer = Callable[[str], dict[str, str]]
 
 
 @dataclass(frozen=True)
@@ -103,28 +103,23 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
 
 
 @pytest.fixture
-def me(bearer: Bearer) -> dict[str, str]:
-    return bearer("register")
-
-
-@pytest.fixture
-def run(client: TestClient, database: Database, settings: Settings, me: dict[str, str]) -> Run:
+def run(client: TestClient, database: Database, settings: Settings, me: Caller) -> Run:
     return job_runner(client, database, settings, me)
 
 
 @pytest.fixture
 def on_map(
-    client: TestClient, me: dict[str, str], run: Run, world: FlatWorld, dsn: str, storage: Storage
+    client: TestClient, me: Caller, run: Run, world: FlatWorld, dsn: str, storage: Storage
 ) -> SceneOnMap:
     publish_world(dsn, storage, world)
     path = f"/scenes?name=scene.tif&sigma_m={SIGMA_M}"
-    scene = client.post(path, content=world.tagged.read_bytes(), headers=me).json()["id"]
+    scene = me.post(path, content=world.tagged.read_bytes()).json()["id"]
     registration = run("register-scene", scene=scene)["jobID"]
     drawn = run("map-scene", scene=scene, registration=registration)
     assert drawn["status"] == "successful", str(drawn)
-    files = client.get(f"/jobs/{registration}/results", headers=me).json()
-    report = client.get(files["report.json"]["href"], headers=me).json()
-    results = client.get(f"/jobs/{drawn['jobID']}/results", headers=me).json()
+    files = me.get(f"/jobs/{registration}/results").json()
+    report = me.get(files["report.json"]["href"]).json()
+    results = me.get(f"/jobs/{drawn['jobID']}/results").json()
     return SceneOnMap(client, me, drawn["jobID"], results, registration, report)
 
 

@@ -6,13 +6,13 @@ from uuid import UUID
 
 import pytest
 
-from amers.app.db import registrations, scenes
+from amers.app.db import scenes
 from amers.app.db.engine import Connection
 from amers.app.db.jobs import attempts, jobs
 from amers.app.db.scene_files import SceneFiles, read_scene_files
 from amers.app.db.scene_registrations import SceneRegistration, last_registrations
 from amers.app.usecases.tokens import create_token
-from tests.app.job_queue import claim
+from tests.app.job_queue import claim, store_registration
 from tests.statements import run_sql
 
 
@@ -49,12 +49,10 @@ def asked(connection: Connection, owner: UUID, *scene_ids: UUID) -> UUID:
 
 def registered(connection: Connection, job_id: UUID, scene_id: UUID, verdict: str) -> None:
     """Store the registration of a scene, whose report and files have the name of its job."""
-    registrations.insert_registration(
+    store_registration(
         connection,
         job_id=job_id,
         scene_id=scene_id,
-        block_versions=[],
-        options={},
         report={"verdict_scope": str(job_id), "on_the_earth": {"ce90_m": 2.0}},
         verdict=verdict,
         files={"report.json": f"results/{job_id}/1/report.json"},

@@ -1,6 +1,5 @@
 """A service draws the raw image of a scene as tiles, for its owner."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -10,13 +9,14 @@ from fastapi.testclient import TestClient
 
 from amers.app.config import Settings
 from amers.app.db.engine import Database
+from tests.app.callers import Bearer
 from tests.app.ledger import job_runner, make_token
 from tests.app.test_orthorectification import write_inputs
 
 
 def test_the_tiles_of_a_scene_are_read_by_ranges(
     client: TestClient,
-    bearer: Callable[[str], dict[str, str]],
+    bearer: Bearer,
     settings: Settings,
     database: Database,
     tmp_path: Path,

@@ -23,6 +23,7 @@ from amers.app.usecases.installation import Installation
 from amers.app.usecases.scenes import SentFile, clean_name, folder_of, upload_scene
 from amers.app.usecases.tokens import create_token
 from amers.app.worker.sweep import sweep_files
+from tests.app.callers import Bearer
 from tests.app.conftest import stored_files
 from tests.app.running_service import running_service
 from tests.app.worker_processes import wait_until
@@ -30,8 +31,6 @@ from tests.statements import run_sql
 
 TIFF = b"II*\0" + bytes(100_000)
 LIMIT_BYTES = 200_000
-
-Bearer = Callable[[str], dict[str, str]]
 
 
 @pytest.fixture
@@ -50,13 +49,13 @@ def test_an_uploaded_scene_is_stored_as_it_was_sent(
     client: TestClient, bearer: Bearer, storage: Storage
 ):
     me = bearer("register")
-    reply = client.post("/scenes?name=IMG_1.TIF&sigma_m=12.5", content=TIFF, headers=me)
+    reply = me.post("/scenes?name=IMG_1.TIF&sigma_m=12.5", content=TIFF)
     assert reply.status_code == 201, reply.text
     scene = reply.json()
     assert (scene["state"], scene["file"], scene["sigma_m"]) == ("uploaded", "IMG_1.TIF", 12.5)
     assert (scene["size_bytes"], scene["sha256"]) == (len(TIFF), hashlib.sha256(TIFF).hexdigest())
-    assert client.get(reply.headers["location"], headers=me).json() == scene
-    assert client.get("/scenes", headers=me).json() == {"scenes": [scene]}
+    assert me.get(reply.headers["location"]).json() == scene
+    assert me.get("/scenes").json() == {"scenes": [scene]}
     assert storage.path(f"scenes/{scene['id']}/IMG_1.TIF").read_bytes() == TIFF
 
 
@@ -68,10 +67,10 @@ def test_the_name_may_come_from_the_content_disposition(client: TestClient, bear
 
 def test_a_model_is_laid_beside_the_image(client: TestClient, bearer: Bearer, storage: Storage):
     me = bearer("register")
-    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()
-    reply = client.put(f"/scenes/{scene['id']}/files/a_RPC.TXT", content=b"LINE_OFF: 1", headers=me)
+    scene = me.post("/scenes?name=a.tif", content=TIFF).json()
+    reply = me.put(f"/scenes/{scene['id']}/files/a_RPC.TXT", content=b"LINE_OFF: 1")
     assert reply.status_code == 200, reply.text
-    assert client.get(f"/scenes/{scene['id']}", headers=me).json()["models"] == ["a_RPC.TXT"]
+    assert me.get(f"/scenes/{scene['id']}").json()["models"] == ["a_RPC.TXT"]
     assert storage.path(f"scenes/{scene['id']}/a_RPC.TXT").read_bytes() == b"LINE_OFF: 1"
 
 
@@ -82,8 +81,8 @@ def test_only_models_are_laid_beside_an_image(
     client: TestClient, bearer: Bearer, name: str, status: int
 ):
     me = bearer("register")
-    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()
-    reply = client.put(f"/scenes/{scene['id']}/files/{name}", content=b"x", headers=me)
+    scene = me.post("/scenes?name=a.tif", content=TIFF).json()
+    reply = me.put(f"/scenes/{scene['id']}/files/{name}", content=b"x")
     assert reply.status_code == status, reply.text
 
 
@@ -92,10 +91,10 @@ def test_a_file_that_is_no_image_is_refused_and_leaves_nothing(
     client: TestClient, bearer: Bearer, storage: Storage, body: bytes
 ):
     me = bearer("register")
-    reply = client.post("/scenes?name=a.tif", content=body, headers=me)
+    reply = me.post("/scenes?name=a.tif", content=body)
     assert reply.status_code == 422
     assert "neither TIFF, JPEG 2000 nor NITF" in reply.json()["detail"]
-    assert client.get("/scenes", headers=me).json() == {"scenes": []}
+    assert me.get("/scenes").json() == {"scenes": []}
     assert stored_files(storage) == []
 
 
@@ -106,7 +105,7 @@ def test_an_upload_announced_too_large_is_refused_before_it_is_read(
     size = {"Content-Length": str(LIMIT_BYTES + 1)}
     reply = client.post("/scenes?name=a.tif", content=b"II*\0", headers=me | size)
     assert reply.status_code == 413
-    assert client.get("/scenes", headers=me).json() == {"scenes": []}
+    assert me.get("/scenes").json() == {"scenes": []}
     assert stored_files(storage) == []
 
 
@@ -115,15 +114,15 @@ def test_an_upload_that_turns_out_too_large_is_cut_off_and_leaves_nothing(
 ):
     me = bearer("register")
     body = chunks(TIFF + bytes(LIMIT_BYTES))
-    reply = client.post("/scenes?name=a.tif", content=body, headers=me)
+    reply = me.post("/scenes?name=a.tif", content=body)
     assert reply.status_code == 413
     assert str(LIMIT_BYTES) in reply.json()["detail"]
-    assert client.get("/scenes", headers=me).json() == {"scenes": []}
+    assert me.get("/scenes").json() == {"scenes": []}
     assert stored_files(storage) == []
 
 
 def test_an_upload_without_announced_length_arrives(client: TestClient, bearer: Bearer):
-    reply = client.post("/scenes?name=a.tif", content=chunks(TIFF), headers=bearer("register"))
+    reply = bearer("register").post("/scenes?name=a.tif", content=chunks(TIFF))
     assert reply.json()["size_bytes"] == len(TIFF)
 
 
@@ -161,7 +160,7 @@ def test_a_checksum_that_does_not_fit_refuses_the_upload(
 
 
 def test_an_upload_without_a_name_is_refused(client: TestClient, bearer: Bearer):
-    reply = client.post("/scenes", content=TIFF, headers=bearer("register"))
+    reply = bearer("register").post("/scenes", content=TIFF)
     assert reply.status_code == 422
     assert "no name" in reply.json()["detail"]
 
@@ -179,36 +178,36 @@ def test_uploading_needs_a_token(
 
 
 def test_a_token_to_read_does_not_upload(client: TestClient, bearer: Bearer):
-    assert client.post("/scenes?name=a.tif", content=TIFF, headers=bearer("read")).status_code == 403
+    assert bearer("read").post("/scenes?name=a.tif", content=TIFF).status_code == 403
 
 
 def test_a_scene_of_another_owner_is_not_found(client: TestClient, bearer: Bearer, storage: Storage):
-    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=bearer("register")).json()
+    scene = bearer("register").post("/scenes?name=a.tif", content=TIFF).json()
     here = f"/scenes/{scene['id']}"
     stranger = bearer("register")
     replies = [
-        client.get(here, headers=stranger),
-        client.delete(here, headers=stranger),
-        client.put(f"{here}/files/a_RPC.TXT", content=b"x", headers=stranger),
+        stranger.get(here),
+        stranger.delete(here),
+        stranger.put(f"{here}/files/a_RPC.TXT", content=b"x"),
     ]
     assert [reply.status_code for reply in replies] == [404, 404, 404]
-    assert client.get("/scenes", headers=stranger).json() == {"scenes": []}
+    assert stranger.get("/scenes").json() == {"scenes": []}
     assert storage.keys("scenes") == [f"scenes/{scene['id']}/a.tif"]
-    assert client.get(here, headers=bearer("admin")).status_code == 200
+    assert bearer("admin").get(here).status_code == 200
 
 
 def test_a_removed_scene_keeps_its_record_and_loses_its_files(
     client: TestClient, bearer: Bearer, storage: Storage
 ):
     me = bearer("register")
-    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()
+    scene = me.post("/scenes?name=a.tif", content=TIFF).json()
     here = f"/scenes/{scene['id']}"
-    client.put(f"{here}/files/a_RPC.TXT", content=b"x", headers=me)
-    assert client.delete(here, headers=me).status_code == 204
-    left = client.get(here, headers=me).json()
+    me.put(f"{here}/files/a_RPC.TXT", content=b"x")
+    assert me.delete(here).status_code == 204
+    left = me.get(here).json()
     assert (left["state"], left["sha256"], left["models"]) == ("removed", scene["sha256"], [])
     assert stored_files(storage) == []
-    late = client.put(f"{here}/files/a_RPC.TXT", content=b"x", headers=me)
+    late = me.put(f"{here}/files/a_RPC.TXT", content=b"x")
     assert late.status_code == 409
 
 
@@ -217,20 +216,20 @@ def test_a_removed_scene_takes_and_gives_no_more_files_and_counts_for_nobody(
 ):
     """Not even those that a deletion has left which broke off."""
     me = bearer("register")
-    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()["id"]
+    scene = me.scene(TIFF, "name=a.tif")
     model = f"/scenes/{scene}/files/a_RPC.TXT"
     announced = {"filename": "b_RPC.TXT", "scene": scene}
-    owner = UUID(client.get("/tokens/self", headers=me).json()["id"])
-    assert client.put(model, content=b"LINE_OFF: 1", headers=me).status_code == 200
-    assert client.get(model, headers=me).content == b"LINE_OFF: 1"
+    owner = UUID(me.get("/tokens/self").json()["id"])
+    assert me.put(model, content=b"LINE_OFF: 1").status_code == 200
+    assert me.get(model).content == b"LINE_OFF: 1"
     before = usage.read_usage(connection, owner)
     assert (before.scenes, before.scene_bytes) == (1, len(TIFF) + 11)
     connection.commit()
-    assert client.delete(f"/scenes/{scene}", headers=me).status_code == 204
+    assert me.delete(f"/scenes/{scene}").status_code == 204
     for name in ("a_RPC.TXT", "a.tif"):
         storage.put(f"scenes/{scene}/{name}", [b"left"])
-        assert client.get(f"/scenes/{scene}/files/{name}", headers=me).status_code == 404
-    assert client.put(model, content=b"LINE_OFF: 2", headers=me).status_code == 409
+        assert me.get(f"/scenes/{scene}/files/{name}").status_code == 404
+    assert me.put(model, content=b"LINE_OFF: 2").status_code == 409
     words = (f"{name} {b64encode(of.encode()).decode()}" for name, of in announced.items())
     headers = me | {
         "Tus-Resumable": "1.0.0",
@@ -258,7 +257,7 @@ def test_a_file_of_another_size_than_announced_leaves_nothing(
 def test_folders_in_a_sent_file_name_are_dropped(client: TestClient, bearer: Bearer, storage: Storage):
     me = bearer("register")
     for name in ("../../../etc/passwd.tif", "/etc/cron.d/x.tif", "..\\..\\x.tif", ".hidden.tif"):
-        reply = client.post("/scenes", params={"name": name}, content=TIFF, headers=me)
+        reply = me.post("/scenes", params={"name": name}, content=TIFF)
         assert reply.status_code == 201, reply.text
         key = f"scenes/{reply.json()['id']}/{reply.json()['file']}"
         assert storage.path(key).resolve().is_relative_to(storage.folder.resolve())
@@ -277,7 +276,7 @@ def test_any_text_becomes_a_name_the_storage_takes_or_is_refused(text: str):
 
 
 def test_the_sweep_removes_what_uploads_cut_off_left_behind(client: TestClient, bearer: Bearer):
-    uploaded = client.post("/scenes?name=a.tif", content=TIFF, headers=bearer("register")).json()
+    uploaded = bearer("register").post("/scenes?name=a.tif", content=TIFF).json()
     app = client.app
     database, storage = app.state.database, app.state.storage  # type: ignore[attr-defined]
     with database.transaction() as connection:

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,12 +15,11 @@ from amers.app.db.jobs import attempts
 from amers.app.errors import InputError
 from amers.app.main import create_app
 from amers.app.worker.attempt import Attempts
+from tests.app.callers import Bearer
 from tests.statements import run_sql
 
 FOREIGN = ("9999", "00001", "8f2c1d0b7a6e")
 """Of a newer Amers, and of other programs that use Alembic."""
-
-Bearer = Callable[[str], dict[str, str]]
 
 
 def set_revision(dsn: str, revision: str) -> None:

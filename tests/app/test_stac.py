@@ -14,25 +14,19 @@ from amers.app.config import Settings
 from amers.app.db import engine, scenes
 from amers.app.main import create_app
 from amers.services.types import Acquisition
+from tests.app.callers import Bearer, Caller
 
 ITEMS = "/collections/scenes/items"
 TAKEN = datetime(2024, 6, 21, 10, 30, tzinfo=UTC)
 GSD_M = 0.5
 seven_decimals_deg = 1e-7
 
-Bearer = Callable[[str], dict[str, str]]
-
 
 @pytest.fixture
-def me(bearer: Bearer) -> dict[str, str]:
-    return bearer("register")
-
-
-@pytest.fixture
-def scene(client: TestClient, me: dict[str, str]) -> str:
-    reply = client.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100), headers=me)
+def scene(me: Caller) -> str:
+    reply = me.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100))
     scene = str(reply.json()["id"])
-    client.put(f"/scenes/{scene}/files/a_RPC.TXT", content=b"LINE_OFF: 1", headers=me)
+    me.put(f"/scenes/{scene}/files/a_RPC.TXT", content=b"LINE_OFF: 1")
     return scene
 
 
@@ -58,9 +52,9 @@ def described(dsn: str, scene: str) -> Callable[..., None]:
 
 
 @pytest.fixture
-def item(client: TestClient, me: dict[str, str], scene: str) -> Callable[[], dict[str, Any]]:
+def item(me: Caller, scene: str) -> Callable[[], dict[str, Any]]:
     def item() -> dict[str, Any]:
-        reply = client.get(f"{ITEMS}/{scene}", headers=me)
+        reply = me.get(f"{ITEMS}/{scene}")
         assert reply.status_code == 200, reply.text
         return dict(reply.json())
 
@@ -102,13 +96,11 @@ def test_a_scene_across_the_antimeridian_has_its_west_greater_than_its_east(item
     assert item()["bbox"] == pytest.approx([179.9, -17.0, -179.9, -16.9], abs=seven_decimals_deg)
 
 
-def test_scenes_are_filtered_by_the_property_names_of_items(
-    client: TestClient, me: dict[str, str], scene: str, described
-):
+def test_scenes_are_filtered_by_the_property_names_of_items(me: Caller, scene: str, described):
     described([[5.0, 43.0], [5.2, 43.0], [5.2, 43.1]])
 
     def found(**query: str) -> list[str]:
-        reply = client.get(ITEMS, params=query, headers=me)
+        reply = me.get(ITEMS, params=query)
         assert reply.status_code == 200, reply.text
         return [feature["id"] for feature in reply.json()["features"]]
 
@@ -117,41 +109,39 @@ def test_scenes_are_filtered_by_the_property_names_of_items(
     assert found(datetime="2024-06-22/..") == found(title="b.tif") == []
 
 
-def test_other_formats_have_the_same_scenes(
-    client: TestClient, me: dict[str, str], scene: str, described
-):
+def test_other_formats_have_the_same_scenes(me: Caller, scene: str, described):
     described([[5.0, 43.0], [5.2, 43.0], [5.2, 43.1]])
     for form in ("csv", "html", "gpkg", "parquet"):
-        reply = client.get(ITEMS, params={"f": form, "datetime": "2024-06-21"}, headers=me)
+        reply = me.get(ITEMS, params={"f": form, "datetime": "2024-06-21"})
         assert reply.status_code == 200, reply.text
-    text = client.get(ITEMS, params={"f": "csv"}, headers=me).text
+    text = me.get(ITEMS, params={"f": "csv"}).text
     assert scene in text
     assert "view:sun_elevation" in text
     mercator = {"crs": "http://www.opengis.net/def/crs/EPSG/0/3857"}
-    feature = client.get(ITEMS, params=mercator, headers=me).json()["features"][0]
+    feature = me.get(ITEMS, params=mercator).json()["features"][0]
     assert "stac_version" not in feature, "items are in longitude and latitude"
 
 
 def test_only_the_owner_gets_the_files_of_a_scene_until_it_is_removed(
-    client: TestClient, me: dict[str, str], bearer: Bearer, scene: str, item
+    client: TestClient, me: Caller, bearer: Bearer, scene: str, item
 ):
     assets = item()["assets"]
     assert set(assets) == {"image", "a_RPC.TXT"}
     image, model = (assets[name]["href"] for name in ("image", "a_RPC.TXT"))
-    assert client.get(image, headers=me).content == b"II*\0" + bytes(100)
-    assert client.get(model, headers=me).content == b"LINE_OFF: 1"
+    assert me.get(image).content == b"II*\0" + bytes(100)
+    assert me.get(model).content == b"LINE_OFF: 1"
     part = client.get(image, headers=me | {"Range": "bytes=0-2"})
     assert (part.status_code, part.content) == (206, b"II*")
     for href in (image, model):
-        assert client.get(href, headers=bearer("register")).status_code == 404
-        assert client.get(href, headers=bearer("read")).status_code == 403
+        assert bearer("register").get(href).status_code == 404
+        assert bearer("read").get(href).status_code == 403
         assert client.get(href).status_code == 401
     for name in ("b.tif", "..%2Fa.tif", "%2e%2e"):
-        assert client.get(f"/scenes/{scene}/files/{name}", headers=me).status_code == 404
-    client.delete(f"/scenes/{scene}", headers=me)
+        assert me.get(f"/scenes/{scene}/files/{name}").status_code == 404
+    me.delete(f"/scenes/{scene}")
     assert item()["assets"] == {}
     assert item()["properties"]["amers:state"] == "removed"
-    assert client.get(image, headers=me).status_code == 404
+    assert me.get(image).status_code == 404
 
 
 def test_a_scene_on_the_server_is_taken_where_it_lies(

@@ -1,7 +1,6 @@
 """Every place that states an accuracy states two: relative to the control points, and on the Earth."""
 
 import json
-import os
 from collections.abc import Callable
 from html import unescape
 from pathlib import Path
@@ -13,9 +12,10 @@ from fastapi.testclient import TestClient
 from amers.app.config import Settings
 from amers.app.storage import Storage
 from amers.services.types import UNKNOWN_FRAME, Frame
+from tests.app.callers import Bearer
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
 from tests.app.worker_processes import ended, running_worker
-from tests.command_line import amers_here
+from tests.command_line import amers_here, environment_of
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
@@ -27,7 +27,6 @@ STATED = Frame.from_sigmas(1.5, 5.0)
 EARTH_LE90_M = 8.22
 a_centimetre = 0.01
 
-Bearer = Callable[[str], dict[str, str]]
 Document = dict[str, Any]
 
 
@@ -51,11 +50,7 @@ def published(world: FlatWorld, dsn: str, storage: Storage) -> None:
 @pytest.fixture
 def amers(settings: Settings) -> Callable[..., str]:
     """Runs the command `amers` on the installation of the test; returns what it prints."""
-    assert settings.database_url is not None
-    environment = os.environ | {
-        "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
-        "AMERS_DATA_FOLDER": str(settings.data_folder),
-    }
+    environment = environment_of(settings)
 
     def run(*words: object, fails: bool = False) -> str:
         done = amers_here(words, environment)

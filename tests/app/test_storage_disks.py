@@ -1,7 +1,7 @@
 """Storages on real disks that are unmounted, read-only or full: reads go on, and deletions work."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from amers.app.storage import Storage, trash
 from amers.app.usecases.blocks.lifecycle import ingest_block
 from amers.app.usecases.installation import Installation
 from amers.app.usecases.tokens import create_token
+from tests.app.callers import Bearer
 from tests.app.full_storage import finish_job
 from tests.app.small_disk import BindMount, Disk
 from tests.factories import make_block
@@ -31,8 +32,6 @@ MEBIBYTE = 1 << 20
 TIFF = b"II*\0" + bytes(MEBIBYTE)
 DATABASE_ROOM = 400 * MEBIBYTE
 LONGEST_REVIVAL_S = 60.0
-
-Bearer = Callable[[str], dict[str, str]]
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import errno
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from uuid import UUID, uuid4
@@ -27,6 +27,7 @@ from amers.app.usecases import storage_identity
 from amers.app.usecases.jobs import do_attempt
 from amers.app.worker.attempt import Attempts
 from amers.app.worker.run import main as run_attempt
+from tests.app.callers import Bearer
 from tests.app.full_storage import finish_job
 from tests.app.s3_server import running_bucket
 from tests.factories import make_block
@@ -37,8 +38,6 @@ TIFF = b"II*\0" + bytes(1000)
 TUS = {"Tus-Resumable": "1.0.0"}
 PIECE = TUS | {"Content-Type": "application/offset+octet-stream"}
 ANNOUNCED = TUS | {"Upload-Length": str(len(TIFF)), "Upload-Metadata": "filename YS50aWY="}
-
-Bearer = Callable[[str], dict[str, str]]
 
 
 class Mount:
@@ -78,11 +77,11 @@ def test_while_the_storage_is_not_mounted_every_write_is_a_503_and_nothing_is_lo
     with engine.connect(dsn) as connection:
         finish_job(connection, storage)
         (job,) = run_sql(connection, "select id from job").fetchall()
-    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()["id"]
+    scene = me.scene(TIFF, "name=a.tif")
     upload = client.post("/uploads", headers=me | ANNOUNCED).headers["location"]
     first = client.patch(upload, content=TIFF[:400], headers=me | PIECE | {"Upload-Offset": "0"})
     assert first.status_code == 204, first.text
-    before = client.get("/scenes", headers=me).json()
+    before = me.get("/scenes").json()
 
     mount.unmount()
     for method, path, headers, content in (
@@ -98,20 +97,20 @@ def test_while_the_storage_is_not_mounted_every_write_is_a_503_and_nothing_is_lo
     ):
         assert_refused(client.request(method, path, headers=headers, content=content))
     assert client.head(upload, headers=me | TUS).status_code == 503
-    assert client.get("/scenes", headers=me).json() == before
+    assert me.get("/scenes").json() == before
     assert client.get("/readyz").json()["parts"]["storage"]["status"] == "failed"
     with engine.connect(dsn) as connection:
         assert run_sql(connection, "select count(*) as n from upload").fetchone() == {"n": 1}
 
     mount.mount()
-    assert client.get(f"/scenes/{scene}/files/a.tif", headers=me).content == TIFF
+    assert me.get(f"/scenes/{scene}/files/a.tif").content == TIFF
     rest = client.patch(upload, content=TIFF[400:], headers=me | PIECE | {"Upload-Offset": "400"})
     assert rest.status_code == 204, rest.text
     name = rest.headers["amers-scene"]
-    assert client.get(f"/scenes/{name}/files/a.tif", headers=me).content == TIFF
-    assert client.post("/scenes?name=b.tif", content=TIFF, headers=me).status_code == 201
-    assert client.delete(f"/scenes/{scene}", headers=me).status_code == 204
-    assert client.delete(f"/jobs/{job['id']}", headers=admin).status_code == 200
+    assert me.get(f"/scenes/{name}/files/a.tif").content == TIFF
+    assert me.post("/scenes?name=b.tif", content=TIFF).status_code == 201
+    assert me.delete(f"/scenes/{scene}").status_code == 204
+    assert admin.delete(f"/jobs/{job['id']}").status_code == 200
     assert storage.keys("results") == []
 
 
@@ -124,9 +123,9 @@ def test_a_storage_that_goes_away_while_bytes_arrive_acknowledges_none_of_them(
         yield TIFF
 
     me = bearer("register")
-    assert_refused(client.post("/scenes?name=a.tif", content=chunks(), headers=me))
+    assert_refused(me.post("/scenes?name=a.tif", content=chunks()))
     mount.mount()
-    assert client.get("/scenes", headers=me).json()["scenes"] == []
+    assert me.get("/scenes").json()["scenes"] == []
 
 
 def test_a_storage_of_another_installation_in_its_place_gets_no_file(
@@ -134,10 +133,10 @@ def test_a_storage_of_another_installation_in_its_place_gets_no_file(
 ):
     monkeypatch.setattr(proof, "VALID_S", 0.0)
     me = bearer("register")
-    assert client.post("/scenes?name=a.tif", content=TIFF, headers=me).status_code == 201
+    assert me.post("/scenes?name=a.tif", content=TIFF).status_code == 201
     before = storage.keys("scenes")
     write_marker(storage, Marker(uuid4(), 1))
-    assert_refused(client.post("/scenes?name=b.tif", content=TIFF, headers=me), "another installation")
+    assert_refused(me.post("/scenes?name=b.tif", content=TIFF), "another installation")
     assert storage.keys("scenes") == before
 
 
@@ -182,7 +181,7 @@ def test_commands_write_nothing_into_a_storage_that_is_not_mounted_and_say_so(
     made = make_block(tmp_path / "block", count=5)
     monkeypatch.setenv("AMERS_DATABASE_URL", dsn)
     monkeypatch.setenv("AMERS_DATA_FOLDER", str(settings.data_folder))
-    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=bearer("register")).json()["id"]
+    scene = bearer("register").scene(TIFF, "name=a.tif")
     mount.unmount()
     for words in (
         ["block", "ingest", str(made.folder)],
@@ -211,7 +210,7 @@ def test_a_storage_whose_folder_is_missing_is_made_by_nobody(
 ):
     mount.unmount()
     mount.folder.rmdir()
-    assert_refused(client.post("/scenes?name=a.tif", content=TIFF, headers=bearer("register")))
+    assert_refused(bearer("register").post("/scenes?name=a.tif", content=TIFF))
     with engine.opened(settings) as database:
         storage = open_storage(settings)
         assert not storage_identity.announce(database.transaction, storage)
@@ -304,23 +303,23 @@ def test_a_storage_that_takes_no_files_says_why_and_is_read_all_the_same(
         raise OSError(number, os.strerror(number), "a file")
 
     me = bearer("register")
-    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()["id"]
+    scene = me.scene(TIFF, "name=a.tif")
     upload = client.post("/uploads", headers=me | ANNOUNCED).headers["location"]
     with monkeypatch.context() as patch:
         patch.setattr("amers.app.storage.folder.mkstemp", fail)
         patch.setattr("amers.app.usecases.uploads._append", fail)
-        refused = client.post("/scenes?name=b.tif", content=TIFF, headers=me)
+        refused = me.post("/scenes?name=b.tif", content=TIFF)
         piece = client.patch(upload, content=TIFF, headers=me | PIECE | {"Upload-Offset": "0"})
         for reply in (refused, piece):
             assert reply.status_code == status, reply.text
             assert reason in reply.json()["detail"]
             assert "Retry-After" in reply.headers
-        assert client.get(f"/scenes/{scene}/files/a.tif", headers=me).content == TIFF
-        assert len(client.get("/scenes", headers=me).json()["scenes"]) == 2, "and the open upload"
+        assert me.get(f"/scenes/{scene}/files/a.tif").content == TIFF
+        assert len(me.get("/scenes").json()["scenes"]) == 2, "and the open upload"
         ready = client.get("/readyz")
         assert (ready.status_code, ready.json()["status"]) == (200, "degraded")
         assert reason in ready.json()["parts"]["storage"]["reason"]
-    assert client.post("/scenes?name=b.tif", content=TIFF, headers=me).status_code == 201
+    assert me.post("/scenes?name=b.tif", content=TIFF).status_code == 201
 
 
 def test_reading_looks_at_no_marker_and_a_write_reads_it_once_a_second(
@@ -352,7 +351,7 @@ def test_a_service_on_a_read_only_database_starts_and_reads(
     client: TestClient, bearer: Bearer, settings: Settings, database: Database
 ):
     me = bearer("register")
-    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()["id"]
+    scene = me.scene(TIFF, "name=a.tif")
     name = str(settings.database_url.get_secret_value()).split("dbname=")[1].split()[0]  # type: ignore[union-attr]
     with database.transaction() as connection:
         run_sql(connection, f'alter database "{name}" set default_transaction_read_only = on')

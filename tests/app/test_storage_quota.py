@@ -5,7 +5,7 @@ import json
 import threading
 import zipfile
 from base64 import b64encode
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from uuid import UUID
 
@@ -27,6 +27,7 @@ from amers.app.usecases.blocks import lifecycle
 from amers.app.usecases.installation import Installation
 from amers.app.usecases.scenes import SentFile, upload_scene, upload_side_file
 from amers.app.usecases.tokens import create_token
+from tests.app.callers import Caller
 from tests.app.job_queue import claim
 from tests.app.ledger import bytes_in_ledger, bytes_in_storage, job_runner, make_token
 from tests.app.s3_server import running_bucket
@@ -58,11 +59,6 @@ def storage(settings: Settings, database: Database) -> Storage:
 
 
 @pytest.fixture
-def admin(bearer: Callable[[str], dict[str, str]]) -> dict[str, str]:
-    return bearer("admin")
-
-
-@pytest.fixture
 def published(connection: Connection, storage: Storage, tmp_path: Path) -> None:
     """A published block, whose points can be exported."""
     lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block").folder)
@@ -79,7 +75,7 @@ def zipped(**files: bytes) -> bytes:
     return out.getvalue()
 
 
-def announce(client: TestClient, me: dict[str, str], size: int, name: str, **more: str):
+def announce(client: TestClient, me: Caller, size: int, name: str, **more: str):
     """The reply to the announcement of a resumable upload."""
     pairs = {"filename": name, **more}.items()
     metadata = ",".join(f"{key} {b64encode(value.encode()).decode()}" for key, value in pairs)
@@ -87,7 +83,7 @@ def announce(client: TestClient, me: dict[str, str], size: int, name: str, **mor
     return client.post("/uploads", headers=headers)
 
 
-def send(client: TestClient, me: dict[str, str], data: bytes, name: str, **more: str):
+def send(client: TestClient, me: Caller, data: bytes, name: str, **more: str):
     """The reply to the only piece of a resumable upload."""
     announced = announce(client, me, len(data), name, **more)
     assert announced.status_code == 201, announced.text
@@ -95,9 +91,9 @@ def send(client: TestClient, me: dict[str, str], data: bytes, name: str, **more:
     return client.patch(url, content=data, headers=me | TUS | {"Upload-Offset": "0"})
 
 
-def used_bytes(client: TestClient, me: dict[str, str], dsn: str) -> int:
+def used_bytes(me: Caller, dsn: str) -> int:
     """What the ledger counts for a caller."""
-    owner = UUID(client.get("/tokens/self", headers=me).json()["id"])
+    owner = UUID(me.get("/tokens/self").json()["id"])
     with engine.connect(dsn) as connection:
         return usage.read_usage(connection, owner).total_bytes
 
@@ -106,7 +102,7 @@ def used_bytes(client: TestClient, me: dict[str, str], dsn: str) -> int:
 @in_both
 def test_a_token_with_a_quota_of_one_byte_leaves_nothing_by_any_way(
     client: TestClient,
-    admin: dict[str, str],
+    admin: Caller,
     storage: Storage,
     settings: Settings,
     database: Database,
@@ -114,27 +110,27 @@ def test_a_token_with_a_quota_of_one_byte_leaves_nothing_by_any_way(
 ):
     me = make_token(client, admin, storage_quota_bytes=1)
     for body in (TIFF, iter([TIFF[:500], TIFF[500:]])):
-        refused = client.post("/scenes?name=a.tif", content=body, headers=me)
+        refused = me.post("/scenes?name=a.tif", content=body)
         assert refused.status_code == 413, refused.text
     assert announce(client, me, 1000, "a.tif").status_code == 413
-    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=admin).json()["id"]
-    side_file = client.put(f"/scenes/{scene}/files/a_RPC.TXT", content=b"x" * 10, headers=me)
+    scene = admin.scene(TIFF, "name=a.tif")
+    side_file = me.put(f"/scenes/{scene}/files/a_RPC.TXT", content=b"x" * 10)
     assert side_file.status_code == 404, "the scene belongs to another token"
-    assert client.delete(f"/scenes/{scene}", headers=admin).status_code == 204
+    assert admin.delete(f"/scenes/{scene}").status_code == 204
 
     export = job_runner(client, database, settings, me)("export-block", bbox=BOX)
     assert (export["status"], export["error"]["error"]) == ("failed", "TooLarge")
     assert "of 1 bytes are used" in export["error"]["detail"]
 
     assert announce(client, me, 1, "a.tif").status_code == 201
-    full = client.post("/processes/export-block/execution", json={"inputs": {"bbox": BOX}}, headers=me)
+    full = me.execute("export-block", {"bbox": BOX})
     assert full.status_code == 413, "the quota is full before the job begins"
     assert bytes_in_storage(storage) == 0
 
 
 @in_both
 def test_an_archive_counts_unpacked_and_is_refused_before_it_is_unpacked(
-    client: TestClient, admin: dict[str, str], storage: Storage, dsn: str
+    client: TestClient, admin: Caller, storage: Storage, dsn: str
 ):
     archive = zipped(a_tif=TIFF[:4] + bytes(200_000), a_RPC_TXT=b"x" * 100)
     assert len(archive) < 2000
@@ -142,46 +138,44 @@ def test_an_archive_counts_unpacked_and_is_refused_before_it_is_unpacked(
     refused = send(client, me, archive, "a.zip")
     assert refused.status_code == 413
     assert "unpacked to 200" in refused.json()["detail"]
-    assert (bytes_in_storage(storage), used_bytes(client, me, dsn)) == (0, 0)
+    assert (bytes_in_storage(storage), used_bytes(me, dsn)) == (0, 0)
     roomy = make_token(client, admin, storage_quota_bytes=200_200)
     assert send(client, roomy, archive, "a.zip").status_code == 204
-    assert used_bytes(client, roomy, dsn) == bytes_in_storage(storage) == 200_104
+    assert used_bytes(roomy, dsn) == bytes_in_storage(storage) == 200_104
 
 
 def test_files_beside_a_scene_count_for_its_owner(
-    client: TestClient, admin: dict[str, str], storage: Storage, dsn: str
+    client: TestClient, admin: Caller, storage: Storage, dsn: str
 ):
     me = make_token(client, admin, storage_quota_bytes=1500)
-    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()["id"]
+    scene = me.scene(TIFF, "name=a.tif")
     for size, status in ((400, 200), (450, 413), (100, 200), (390, 200)):
-        beside = client.put(f"/scenes/{scene}/files/a_RPC.TXT", content=b"x" * size, headers=me)
+        beside = me.put(f"/scenes/{scene}/files/a_RPC.TXT", content=b"x" * size)
         assert beside.status_code == status, (size, beside.text)
-    assert used_bytes(client, me, dsn) == 1390
+    assert used_bytes(me, dsn) == 1390
     for chunks in ([b"x" * 60, b"x" * 60], [b"x" * 50]):
-        chunked = client.put(f"/scenes/{scene}/files/b_RPC.TXT", content=iter(chunks), headers=me)
+        chunked = me.put(f"/scenes/{scene}/files/b_RPC.TXT", content=iter(chunks))
     assert chunked.status_code == 200
-    by_admin = client.put(f"/scenes/{scene}/files/c_RPC.TXT", content=b"x" * 100, headers=admin)
+    by_admin = admin.put(f"/scenes/{scene}/files/c_RPC.TXT", content=b"x" * 100)
     assert by_admin.status_code == 413, "the bytes count for the owner, whoever sends them"
     name, of = b64encode(b"c_RPC.TXT").decode(), b64encode(scene.encode()).decode()
     announced = {"Upload-Length": "100", "Upload-Metadata": f"filename {name},scene {of}"}
     by_admin = client.post("/uploads", headers=admin | TUS | announced)
     assert by_admin.status_code == 413, "however they are sent"
-    assert used_bytes(client, me, dsn) == bytes_in_storage(storage) == 1440
+    assert used_bytes(me, dsn) == bytes_in_storage(storage) == 1440
 
 
-def test_a_scene_has_no_more_side_files_than_allowed(
-    client: TestClient, admin: dict[str, str], monkeypatch: pytest.MonkeyPatch
-):
+def test_a_scene_has_no_more_side_files_than_allowed(admin: Caller, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("amers.app.usecases.scenes.MOST_SIDE_FILES", 2)
-    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=admin).json()["id"]
+    scene = admin.scene(TIFF, "name=a.tif")
     statuses = [
-        client.put(f"/scenes/{scene}/files/{name}.txt", content=b"", headers=admin).status_code
+        admin.put(f"/scenes/{scene}/files/{name}.txt", content=b"").status_code
         for name in ("a", "b", "c", "a")
     ]
     assert statuses == [200, 200, 429, 200]
 
 
-def test_a_token_has_no_more_open_uploads_than_allowed(client: TestClient, admin: dict[str, str]):
+def test_a_token_has_no_more_open_uploads_than_allowed(client: TestClient, admin: Caller):
     me = make_token(client, admin)
     statuses = [announce(client, me, 10, "a.tif").status_code for _ in range(3)]
     assert statuses == [201, 201, 429]
@@ -189,30 +183,26 @@ def test_a_token_has_no_more_open_uploads_than_allowed(client: TestClient, admin
     assert client.delete(url, headers=admin | TUS).status_code == 204, "others are not affected"
 
 
-def test_a_token_keeps_no_more_jobs_than_allowed_and_can_remove_them(
-    client: TestClient, admin: dict[str, str]
-):
+def test_a_token_keeps_no_more_jobs_than_allowed_and_can_remove_them(client: TestClient, admin: Caller):
     me = make_token(client, admin)
 
     def ask():
-        return client.post(
-            "/processes/export-block/execution", json={"inputs": {"bbox": BOX}}, headers=me
-        )
+        return me.execute("export-block", {"bbox": BOX})
 
     made = [ask().headers["location"] for _ in range(2)]
     for url in made:
-        assert client.delete(url, headers=me).json()["status"] == "dismissed"
+        assert me.delete(url).json()["status"] == "dismissed"
     refused = ask()
     assert refused.status_code == 429
     assert "DELETE /jobs/ID" in refused.json()["detail"]
-    assert client.delete(made[0], headers=me).json()["status"] == "dismissed"
-    assert client.get(made[0], headers=me).status_code == 404
+    assert me.delete(made[0]).json()["status"] == "dismissed"
+    assert me.get(made[0]).status_code == 404
     assert ask().status_code == 201
 
 
-def test_inputs_of_a_job_have_a_limit(client: TestClient, admin: dict[str, str]):
+def test_inputs_of_a_job_have_a_limit(admin: Caller):
     inputs = {"bbox": BOX, "title": "x" * 70_000}
-    refused = client.post("/processes/export-block/execution", json={"inputs": inputs}, headers=admin)
+    refused = admin.execute("export-block", inputs)
     assert refused.status_code == 422
     assert "at most 65536 expected" in refused.json()["detail"]
 
@@ -328,7 +318,7 @@ def test_a_token_may_fill_its_own_quota_to_the_last_byte_and_a_quota_of_nothing_
 @in_both
 def test_an_owner_removes_the_results_of_a_job_and_the_history_stays(
     client: TestClient,
-    admin: dict[str, str],
+    admin: Caller,
     storage: Storage,
     settings: Settings,
     database: Database,
@@ -339,13 +329,13 @@ def test_an_owner_removes_the_results_of_a_job_and_the_history_stays(
     job = job_runner(client, database, settings, me)("export-block", bbox=BOX)
     assert job["status"] == "successful", job
     here = f"/jobs/{job['jobID']}"
-    assert used_bytes(client, me, dsn) == bytes_in_storage(storage) > 1000
+    assert used_bytes(me, dsn) == bytes_in_storage(storage) > 1000
     stranger = make_token(client, admin)
-    assert client.delete(here, headers=stranger).status_code == 404
-    assert client.delete(here, headers=me).json()["status"] == "dismissed"
-    assert client.get(here, headers=me).status_code == 404
-    assert used_bytes(client, me, dsn) == bytes_in_storage(storage) == 0
-    record = client.get("/audit", params={"subject": job["jobID"]}, headers=admin).json()["changes"]
+    assert stranger.delete(here).status_code == 404
+    assert me.delete(here).json()["status"] == "dismissed"
+    assert me.get(here).status_code == 404
+    assert used_bytes(me, dsn) == bytes_in_storage(storage) == 0
+    record = admin.get("/audit", params={"subject": job["jobID"]}).json()["changes"]
     assert record[0]["action"] == "deleted"
 
 
@@ -379,7 +369,7 @@ def test_an_attempt_that_is_lost_gives_its_room_back(
 @in_both
 def test_the_ledger_equals_the_storage_after_a_mixed_run(
     client: TestClient,
-    admin: dict[str, str],
+    admin: Caller,
     storage: Storage,
     settings: Settings,
     database: Database,
@@ -388,29 +378,26 @@ def test_the_ledger_equals_the_storage_after_a_mixed_run(
 ):
     callers = [make_token(client, admin), make_token(client, admin, storage_quota_bytes=150_000)]
     for me in callers:
-        kept, removed = (
-            client.post("/scenes?name=a.tif", content=body, headers=me).json()["id"]
-            for body in (TIFF, iter([TIFF, b"more"]))
-        )
+        kept, removed = (me.scene(body, "name=a.tif") for body in (TIFF, iter([TIFF, b"more"])))
         for scene in (kept, removed):
             for content in (b"x" * 300, b"x" * 200):
-                client.put(f"/scenes/{scene}/files/a_RPC.TXT", content=content, headers=me)
+                me.put(f"/scenes/{scene}/files/a_RPC.TXT", content=content)
         assert send(client, me, b"x" * 50, "b_RPC.TXT", scene=kept).status_code == 204
         assert send(client, me, TIFF, "b.tif").status_code == 204
         archive = zipped(c_tif=TIFF + bytes(9000), c_RPC_TXT=b"x")
         assert send(client, me, archive, "c.zip").status_code == 204
-        assert client.post("/scenes?name=a.tif", content=b"no image", headers=me).status_code == 422
-        assert client.delete(f"/scenes/{removed}", headers=me).status_code == 204
+        assert me.post("/scenes?name=a.tif", content=b"no image").status_code == 422
+        assert me.delete(f"/scenes/{removed}").status_code == 204
         run = job_runner(client, database, settings, me)
         run("export-block", bbox=BOX)
         run("export-block", bbox=(50.0, 43.0, 51.0, 44.0))
     archive = zipped(block_json=b"{}")
-    assert client.put("/blocks/uploads/b.zip", content=archive, headers=admin).status_code < 300
-    assert client.put("/blocks/uploads/b.zip", content=iter([archive]), headers=admin).status_code < 300
+    assert admin.put("/blocks/uploads/b.zip", content=archive).status_code < 300
+    assert admin.put("/blocks/uploads/b.zip", content=iter([archive])).status_code < 300
     with engine.connect(dsn) as connection:
         assert bytes_in_ledger(connection) == bytes_in_storage(storage)
         held = {one.owner: one for one in usage.read_all_usage(connection)}
-    roomy, small = (held[UUID(client.get("/tokens/self", headers=me).json()["id"])] for me in callers)
+    roomy, small = (held[UUID(me.get("/tokens/self").json()["id"])] for me in callers)
     assert (roomy.scenes, roomy.jobs, roomy.open_uploads) == (3, 2, 0)
     assert roomy.scene_bytes == small.scene_bytes == 1000 + 200 + 50 + 1000 + 10_000 + 1
     assert roomy.result_bytes > 150_000
@@ -420,7 +407,7 @@ def test_the_ledger_equals_the_storage_after_a_mixed_run(
 @in_both
 def test_usage_is_shown_to_callers_administrators_and_operators(
     client: TestClient,
-    admin: dict[str, str],
+    admin: Caller,
     storage: Storage,
     settings: Settings,
     database: Database,
@@ -428,14 +415,14 @@ def test_usage_is_shown_to_callers_administrators_and_operators(
     monkeypatch: pytest.MonkeyPatch,
 ):
     me = make_token(client, admin, storage_quota_bytes=4000)
-    assert client.post("/scenes?name=a.tif", content=TIFF, headers=me).status_code == 201
+    assert me.post("/scenes?name=a.tif", content=TIFF).status_code == 201
     assert announce(client, me, 600, "b.tif").status_code == 201
     stray = storage.put(f"scenes/{UUID(int=1)}/stray.tif", [bytes(70)])
     storage.put("trash/2026-01-01_1h/scenes/a", [bytes(30)])
-    own = client.get("/tokens/self/usage", headers=me).json()
+    own = me.get("/tokens/self/usage").json()
     assert (own["scenes"], own["open_uploads"], own["total_bytes"], own["share"]) == (2, 1, 1600, 0.4)
-    assert client.get("/tokens/usage", headers=me).status_code == 403
-    assert client.get("/tokens/usage", headers=admin).json()["owners"] == [own]
+    assert me.get("/tokens/usage").status_code == 403
+    assert admin.get("/tokens/usage").json()["owners"] == [own]
 
     assert settings.database_url is not None
     monkeypatch.setenv("AMERS_DATABASE_URL", settings.database_url.get_secret_value())

@@ -35,6 +35,7 @@ from amers.app.usecases.garbage_collection import (
 )
 from amers.app.worker import sweep
 from amers.app.worker.sweep import MOST_BETWEEN_S, Sweeper, sweep_files, sweep_records
+from tests.app.callers import Bearer
 from tests.app.point_history import jump, let_pass
 from tests.factories import make_block
 from tests.statements import run_sql
@@ -63,7 +64,7 @@ def database(client: TestClient) -> Database:
 
 
 @pytest.fixture
-def me(bearer: Callable[[str], dict[str, str]]) -> dict[str, str]:
+def me(bearer: Bearer) -> dict[str, str]:
     return bearer("register") | TUS
 
 

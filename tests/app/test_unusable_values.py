@@ -2,7 +2,7 @@
 
 import json
 from base64 import b64encode
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -10,6 +10,7 @@ from fastapi.testclient import TestClient
 
 from amers.app.json_values import unusable_body, unusable_value
 from amers.app.usecases.jobs import PROCESSES
+from tests.app.callers import Caller
 
 JSON = {"Content-Type": "application/json"}
 TIFF = b"II*\0" + bytes(100)
@@ -34,21 +35,11 @@ NO_CRS = (
 )
 """Unknown codes, those of heights, of the Earth's centre, of the Moon, definitions and addresses."""
 
-Bearer = Callable[[str], dict[str, str]]
-
 
 @pytest.fixture
-def admin(bearer: Bearer) -> dict[str, str]:
-    return bearer("admin")
-
-
-@pytest.fixture
-def inputs(client: TestClient, admin: dict[str, str]) -> dict[str, dict[str, Any]]:
+def inputs(admin: Caller) -> dict[str, dict[str, Any]]:
     """Inputs of every process that lack nothing; a new process needs a line here."""
-    scene, other = (
-        client.post(f"/scenes?name={name}.tif", content=TIFF, headers=admin).json()["id"]
-        for name in "ab"
-    )
+    scene, other = (admin.scene(TIFF, f"name={name}.tif") for name in "ab")
     return {
         "register-scene": {"scene": scene},
         "register-scenes": {"scenes": [scene, other]},
@@ -91,7 +82,7 @@ def document(base: dict[str, Any], path: tuple[str, ...], value: str) -> str:
 @pytest.mark.thorough
 @pytest.mark.parametrize("process_id", PROCESSES)
 def test_no_input_of_a_process_accepts_what_json_cannot_carry(
-    client: TestClient, admin: dict[str, str], inputs: dict[str, dict[str, Any]], process_id: str
+    client: TestClient, admin: Caller, inputs: dict[str, dict[str, Any]], process_id: str
 ):
     schema = PROCESSES[process_id].input_schema()
     url, number = f"/processes/{process_id}/execution", 0
@@ -109,7 +100,7 @@ def test_no_input_of_a_process_accepts_what_json_cannot_carry(
 
 @pytest.mark.parametrize("value", ["NaN", "Infinity", "1e999", '"inf"'])
 def test_an_option_without_a_finite_value_is_named(
-    client: TestClient, admin: dict[str, str], inputs: dict[str, dict[str, Any]], value: str
+    client: TestClient, admin: Caller, inputs: dict[str, dict[str, Any]], value: str
 ):
     body = f'{{"inputs": {document(inputs["orthorectify"], ("map", "gsd_m"), value)}}}'
     reply = client.post("/processes/orthorectify/execution", content=body, headers=admin | JSON)
@@ -118,9 +109,7 @@ def test_an_option_without_a_finite_value_is_named(
 
 
 @pytest.mark.thorough
-def test_every_body_of_the_api_is_free_of_what_json_cannot_carry(
-    client: TestClient, admin: dict[str, str]
-):
+def test_every_body_of_the_api_is_free_of_what_json_cannot_carry(client: TestClient, admin: Caller):
     described = client.get("/api").json()
     definitions, number = described["components"]["schemas"], 0
     for path, methods in described["paths"].items():
@@ -139,9 +128,7 @@ def test_every_body_of_the_api_is_free_of_what_json_cannot_carry(
 
 
 @pytest.mark.thorough
-def test_no_parameter_of_the_api_accepts_numbers_that_are_none(
-    client: TestClient, admin: dict[str, str]
-):
+def test_no_parameter_of_the_api_accepts_numbers_that_are_none(client: TestClient, admin: Caller):
     number = 0
     for path, methods in client.get("/api").json()["paths"].items():
         filled = "/".join("%ED%A0%80" if part.startswith("{") else part for part in path.split("/"))
@@ -170,14 +157,14 @@ def test_no_parameter_of_the_api_accepts_numbers_that_are_none(
     ],
 )
 def test_the_name_of_a_file_is_text_however_it_is_encoded(
-    client: TestClient, admin: dict[str, str], disposition: bytes
+    client: TestClient, admin: Caller, disposition: bytes
 ):
     headers = {name.encode(): value.encode() for name, value in admin.items()}
     reply = client.post("/scenes", content=TIFF, headers=headers | {b"Content-Disposition": disposition})
     assert reply.status_code in (201, 422), reply.text
 
 
-def test_metadata_of_an_upload_is_text(client: TestClient, admin: dict[str, str]):
+def test_metadata_of_an_upload_is_text(client: TestClient, admin: Caller):
     for value in (b"\xed\xa0\x80.tif", b"a\0.tif", "\udcff.tif".encode("utf-8", "surrogatepass")):
         metadata = f"filename {b64encode(value).decode()}"
         headers = {"Tus-Resumable": "1.0.0", "Upload-Length": "10", "Upload-Metadata": metadata}
@@ -197,7 +184,7 @@ def test_metadata_of_an_upload_is_text(client: TestClient, admin: dict[str, str]
 )
 def test_a_reference_system_that_is_none_is_refused_when_it_is_requested(
     client: TestClient,
-    admin: dict[str, str],
+    admin: Caller,
     inputs: dict[str, dict[str, Any]],
     process_id: str,
     path: tuple[str, ...],
@@ -211,7 +198,7 @@ def test_a_reference_system_that_is_none_is_refused_when_it_is_requested(
 
 
 def test_known_reference_systems_are_accepted(
-    client: TestClient, admin: dict[str, str], inputs: dict[str, dict[str, Any]]
+    client: TestClient, admin: Caller, inputs: dict[str, dict[str, Any]]
 ):
     for process_id, path, name in (
         ("orthorectify", ("map", "crs"), "EPSG:32631"),

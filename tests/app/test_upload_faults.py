@@ -7,7 +7,7 @@ import subprocess
 import sys
 import zipfile
 from base64 import b64encode
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -19,8 +19,10 @@ from amers.app.config import Settings
 from amers.app.db import engine
 from amers.app.main import create_app
 from amers.app.storage import Storage
+from tests.app.callers import Bearer
 from tests.app.s3_server import running_bucket
 from tests.app.worker_processes import wait_until
+from tests.command_line import environment_of
 from tests.service_process import free_port
 from tests.statements import run_sql
 from tests.unproven import unproven_storage
@@ -40,8 +42,6 @@ COMPLETIONS = {
     "scene": "new.state = 'uploaded' and new.models <> '{}'::jsonb or new.state <> old.state",
 }
 """Which updates record a stored file."""
-
-Bearer = Callable[[str], dict[str, str]]
 
 
 @pytest.fixture(params=["folder", "bucket"])
@@ -189,12 +189,8 @@ def test_an_upload_stored_when_the_api_is_killed_is_completed_by_its_sender(
 @contextmanager
 def killed_service(settings: Settings, log: Path) -> Iterator[str]:
     """The address of `amers serve`, whose processes are all killed at the end."""
-    assert settings.database_url is not None
     port = free_port()
-    environment = os.environ | {
-        "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
-        "AMERS_DATA_FOLDER": str(settings.data_folder),
-    }
+    environment = environment_of(settings)
     command = [sys.executable, "-m", "amers", "serve", "--no-worker", "--port", str(port)]
     with log.open("wb") as output:
         service = subprocess.Popen(

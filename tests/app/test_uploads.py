@@ -8,7 +8,7 @@ import threading
 import time
 import zipfile
 from base64 import b64encode
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
@@ -35,6 +35,7 @@ from amers.app.usecases.blocks.uploads import find_uploaded_block
 from amers.app.usecases.scenes import SIDE_FILE_LIMIT_BYTES
 from amers.app.usecases.uploads import UPLOAD_PREFIX, remove_abandoned_uploads
 from amers.app.worker.sweep import sweep_files
+from tests.app.callers import Bearer, Caller
 from tests.app.conftest import stored_files
 from tests.app.ledger import bytes_in_ledger, bytes_in_storage, make_token
 from tests.app.point_history import let_pass
@@ -45,8 +46,6 @@ LIMIT_BYTES = 400_000
 TUS = {"Tus-Resumable": "1.0.0"}
 PIECE = {"Content-Type": "application/offset+octet-stream"}
 BREAKS = 10
-
-Bearer = Callable[[str], dict[str, str]]
 
 
 @pytest.fixture
@@ -82,7 +81,7 @@ def said(**values: str) -> dict[str, str]:
     return {"Upload-Metadata": ",".join(pairs)}
 
 
-def begun(client: TestClient, me: dict[str, str], size: int, **values: str) -> httpx.Response:
+def begun(client: TestClient, me: Caller, size: int, **values: str) -> httpx.Response:
     return client.post("/uploads", headers=me | {"Upload-Length": str(size)} | said(**values))
 
 
@@ -92,7 +91,7 @@ def piece(
     return client.patch(url, content=data, headers=me | PIECE | {"Upload-Offset": str(start)} | more)
 
 
-def whole(client: TestClient, me: dict[str, str], data: bytes, **values: str) -> httpx.Response:
+def whole(client: TestClient, me: Caller, data: bytes, **values: str) -> httpx.Response:
     """The reply to the only piece of an upload."""
     reply = begun(client, me, len(data), **values)
     assert reply.status_code == 201, reply.text
@@ -150,7 +149,7 @@ def probe(http: httpx.Client, url: str) -> int:
     return http.patch(url, content=b"", headers=PIECE | {"Upload-Offset": start}).status_code
 
 
-def test_the_service_reports_the_tus_extensions_it_supports(client: TestClient, me: dict[str, str]):
+def test_the_service_reports_the_tus_extensions_it_supports(client: TestClient, me: Caller):
     reply_headers = client.options("/uploads").headers
     assert reply_headers["tus-version"] == "1.0.0"
     assert set(reply_headers["tus-extension"].split(",")) == {
@@ -165,22 +164,22 @@ def test_the_service_reports_the_tus_extensions_it_supports(client: TestClient, 
 
 
 def test_an_image_and_the_file_with_its_model_become_one_scene(
-    client: TestClient, me: dict[str, str], storage: Storage
+    client: TestClient, me: Caller, storage: Storage
 ):
     reply = begun(client, me, len(TIFF), filename="IMG.TIF", sigma_m="7.5")
     assert reply.headers["upload-expires"]
     scene = reply.headers["amers-scene"]
-    assert client.get(f"/scenes/{scene}", headers=me).json()["state"] == "uploading"
-    assert client.delete(f"/scenes/{scene}", headers=me).status_code == 409, "its upload is deleted"
+    assert me.get(f"/scenes/{scene}").json()["state"] == "uploading"
+    assert me.delete(f"/scenes/{scene}").status_code == 409, "its upload is deleted"
     model = begun(client, me, 4, filename="RPC_IMG.XML", scene=scene)
     assert piece(client, model.headers["location"], me, 0, b"<a/>").status_code == 204
     url = reply.headers["location"]
     assert piece(client, url, me, 0, TIFF[:1000]).headers["upload-offset"] == "1000"
-    reply_headers = client.head(url, headers=me).headers
+    reply_headers = me.head(url).headers
     assert (reply_headers["upload-offset"], reply_headers["upload-length"]) == ("1000", str(len(TIFF)))
     assert reply_headers["cache-control"] == "no-store"
     assert piece(client, url, me, 1000, TIFF[1000:]).status_code == 204
-    document = client.get(f"/scenes/{scene}", headers=me).json()
+    document = me.get(f"/scenes/{scene}").json()
     assert (document["state"], document["models"], document["sigma_m"]) == (
         "uploaded",
         ["RPC_IMG.XML"],
@@ -190,9 +189,7 @@ def test_an_image_and_the_file_with_its_model_become_one_scene(
     assert list(storage.scratch().iterdir()) == []
 
 
-def test_a_piece_that_does_not_begin_where_the_file_ends_is_refused(
-    client: TestClient, me: dict[str, str]
-):
+def test_a_piece_that_does_not_begin_where_the_file_ends_is_refused(client: TestClient, me: Caller):
     url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
     piece(client, url, me, 0, TIFF[:100])
     for start in (0, 99, 101):
@@ -200,19 +197,19 @@ def test_a_piece_that_does_not_begin_where_the_file_ends_is_refused(
     reply = client.patch(url, content=b"x", headers=me | {"Upload-Offset": "100"})
     assert reply.status_code == 415
     assert piece(client, url, me, 100, TIFF).status_code == 413
-    assert client.head(url, headers=me).headers["upload-offset"] == "100"
+    assert me.head(url).headers["upload-offset"] == "100"
 
 
-def test_a_piece_with_a_wrong_checksum_is_discarded(client: TestClient, me: dict[str, str]):
+def test_a_piece_with_a_wrong_checksum_is_discarded(client: TestClient, me: Caller):
     url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
     for algorithm in ("sha1", "sha256"):
-        start = int(client.head(url, headers=me).headers["upload-offset"])
+        start = int(me.head(url).headers["upload-offset"])
         data = TIFF[start : start + 100]
         right = b64encode(hashlib.new(algorithm, data).digest()).decode()
         wrong = b64encode(hashlib.new(algorithm, b"other").digest()).decode()
         bad = piece(client, url, me, start, data, **{"Upload-Checksum": f"{algorithm} {wrong}"})
         assert bad.status_code == 460
-        assert int(client.head(url, headers=me).headers["upload-offset"]) == start
+        assert int(me.head(url).headers["upload-offset"]) == start
         good = piece(client, url, me, start, data, **{"Upload-Checksum": f"{algorithm} {right}"})
         assert good.status_code == 204
     for unknown in ("md5 AAAA", "sha1 AAAA", "sha256"):
@@ -240,19 +237,14 @@ def tar_with_a_broken_later_header() -> bytes:
     ],
 )
 def test_an_unusable_file_is_refused_and_deleted(
-    client: TestClient,
-    me: dict[str, str],
-    storage: Storage,
-    data: bytes,
-    metadata: dict[str, str],
-    message: str,
+    client: TestClient, me: Caller, storage: Storage, data: bytes, metadata: dict[str, str], message: str
 ):
     reply = begun(client, me, len(data), **metadata)
     refused = piece(client, reply.headers["location"], me, 0, data)
     assert refused.status_code == 422
     assert message in refused.json()["detail"]
-    assert client.head(reply.headers["location"], headers=me).status_code == 404
-    assert client.get("/scenes", headers=me).json() == {"scenes": []}
+    assert me.head(reply.headers["location"]).status_code == 404
+    assert me.get("/scenes").json() == {"scenes": []}
     assert stored_files(storage) == []
 
 
@@ -274,11 +266,11 @@ def test_an_unusable_file_is_refused_and_deleted(
     ],
 )
 def test_an_unusable_upload_is_refused_before_it_begins(
-    client: TestClient, me: dict[str, str], size: int, metadata: dict[str, str], status: int
+    client: TestClient, me: Caller, size: int, metadata: dict[str, str], status: int
 ):
     reply = begun(client, me, size, **metadata)
     assert reply.status_code == status, reply.text
-    assert client.get("/scenes", headers=me).json() == {"scenes": []}
+    assert me.get("/scenes").json() == {"scenes": []}
 
 
 def zipped(files: dict[str, bytes]) -> bytes:
@@ -290,12 +282,12 @@ def zipped(files: dict[str, bytes]) -> bytes:
 
 
 def test_an_archive_with_an_image_and_its_model_becomes_a_scene(
-    client: TestClient, me: dict[str, str], storage: Storage
+    client: TestClient, me: Caller, storage: Storage
 ):
     files = {"p/IMG_1.TIF": TIFF, "p/RPC_1.XML": b"<a/>", "p/READ.ME": b"x", "q/RPC_2.XML": b"<b/>"}
     reply = whole(client, me, zipped(files), filename="delivery.zip")
     assert reply.status_code == 204, reply.text
-    scene = client.get(f"/scenes/{reply.headers['amers-scene']}", headers=me).json()
+    scene = me.get(f"/scenes/{reply.headers['amers-scene']}").json()
     assert (scene["file"], scene["models"]) == ("IMG_1.TIF", ["RPC_1.XML"])
     assert scene["sha256"] == hashlib.sha256(TIFF).hexdigest()
     assert storage.keys("scenes") == [f"scenes/{scene['id']}/{n}" for n in ("IMG_1.TIF", "RPC_1.XML")]
@@ -303,12 +295,7 @@ def test_an_archive_with_an_image_and_its_model_becomes_a_scene(
 
 @pytest.mark.parametrize(("room", "status"), [(0, 204), (-1, 413)])
 def test_an_archive_needs_the_room_of_what_it_unpacks_to_and_no_more(
-    client: TestClient,
-    bearer: Bearer,
-    storage: Storage,
-    connection: Connection,
-    room: int,
-    status: int,
+    client: TestClient, bearer: Bearer, storage: Storage, connection: Connection, room: int, status: int
 ):
     """It is far smaller itself, and has files that nobody needs."""
     files = {"a.tif": b"II*\0" + bytes(200_000), "a_RPC.TXT": bytes(3000), "READ.ME": bytes(100_000)}
@@ -331,7 +318,7 @@ def test_an_archive_needs_the_room_of_what_it_unpacks_to_and_no_more(
     ],
 )
 def test_an_archive_that_could_do_harm_or_is_no_scene_is_refused(
-    client: TestClient, me: dict[str, str], storage: Storage, files: dict[str, bytes], message: str
+    client: TestClient, me: Caller, storage: Storage, files: dict[str, bytes], message: str
 ):
     reply = whole(client, me, zipped(files), filename="delivery.zip")
     assert reply.status_code == 422
@@ -339,29 +326,29 @@ def test_an_archive_that_could_do_harm_or_is_no_scene_is_refused(
     assert stored_files(storage) == []
 
 
-def test_an_upload_of_another_owner_is_not_found(client: TestClient, me: dict[str, str], bearer: Bearer):
+def test_an_upload_of_another_owner_is_not_found(client: TestClient, me: Caller, bearer: Bearer):
     url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
     stranger = bearer("register") | TUS
-    assert client.head(url, headers=stranger).status_code == 404
+    assert stranger.head(url).status_code == 404
     assert piece(client, url, stranger, 0, TIFF).status_code == 404
-    assert client.delete(url, headers=stranger).status_code == 404
+    assert stranger.delete(url).status_code == 404
     assert client.head(url, headers=TUS).status_code == 401
 
 
 def test_an_upload_that_is_ended_or_expires_leaves_nothing(
-    client: TestClient, me: dict[str, str], storage: Storage
+    client: TestClient, me: Caller, storage: Storage
 ):
     first, second = (begun(client, me, len(TIFF), filename="a.tif") for _ in range(2))
     piece(client, first.headers["location"], me, 0, TIFF[:100])
     piece(client, second.headers["location"], me, 0, TIFF[:100])
-    assert client.delete(first.headers["location"], headers=me).status_code == 204
-    assert client.head(first.headers["location"], headers=me).status_code == 404
+    assert me.delete(first.headers["location"]).status_code == 204
+    assert me.head(first.headers["location"]).status_code == 404
     database = client.app.state.database  # type: ignore[attr-defined]
     remove_abandoned_uploads(database, storage)
-    assert client.head(second.headers["location"], headers=me).status_code == 200
+    assert me.head(second.headers["location"]).status_code == 200
     with database.transaction() as connection:
         let_pass(connection, hours=LIFE_HOURS + 1)
-    assert client.head(second.headers["location"], headers=me).status_code == 404
+    assert me.head(second.headers["location"]).status_code == 404
     remove_abandoned_uploads(database, storage)
     assert list(storage.scratch().iterdir()) == []
 
@@ -415,7 +402,7 @@ def test_a_block_that_has_arrived_is_there_to_be_ingested(
 
 @pytest.mark.parametrize("version", [None, "0.2.2", "1.0", ""])
 def test_a_request_without_the_version_of_the_protocol_is_refused_and_changes_nothing(
-    client: TestClient, me: dict[str, str], version: str | None
+    client: TestClient, me: Caller, version: str | None
 ):
     url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
     piece(client, url, me, 0, TIFF[:10])
@@ -435,36 +422,36 @@ def test_a_request_without_the_version_of_the_protocol_is_refused_and_changes_no
     assert len(client.get("/scenes", headers=other).json()["scenes"]) == 1
 
 
-def shown(client: TestClient, me: dict[str, str], reply: httpx.Response) -> dict[str, object]:
+def shown(me: Caller, reply: httpx.Response) -> dict[str, object]:
     """The document of the upload that a reply has created."""
     assert reply.status_code == 201, reply.text
-    document: dict[str, object] = client.get(reply.headers["location"], headers=me).json()
+    document: dict[str, object] = me.get(reply.headers["location"]).json()
     return document
 
 
 @pytest.fixture
-def arriving(client: TestClient, me: dict[str, str]) -> str:
+def arriving(client: TestClient, me: Caller) -> str:
     """The id of a scene whose image arrives."""
     return str(begun(client, me, 10, filename="a.tif").headers["amers-scene"])
 
 
 @pytest.mark.parametrize("named", [{}, {"purpose": "model"}])
 def test_a_file_that_names_a_scene_is_a_model_of_it(
-    client: TestClient, me: dict[str, str], arriving: str, named: dict[str, str]
+    client: TestClient, me: Caller, arriving: str, named: dict[str, str]
 ):
-    model = shown(client, me, begun(client, me, 10, filename="a.xml", scene=arriving, **named))
+    model = shown(me, begun(client, me, 10, filename="a.xml", scene=arriving, **named))
     assert (model["purpose"], model["scene"]) == ("model", arriving)
 
 
 @pytest.mark.parametrize("named", [{}, {"purpose": "image"}])
 def test_a_file_that_names_no_scene_is_the_image_of_another_one(
-    client: TestClient, me: dict[str, str], arriving: str, named: dict[str, str]
+    client: TestClient, me: Caller, arriving: str, named: dict[str, str]
 ):
-    image = shown(client, me, begun(client, me, 10, filename="a.tif", **named))
+    image = shown(me, begun(client, me, 10, filename="a.tif", **named))
     assert (image["purpose"], image["scene"] == arriving) == ("image", False)
 
 
-def test_an_image_does_not_join_a_scene(client: TestClient, me: dict[str, str], arriving: str):
+def test_an_image_does_not_join_a_scene(client: TestClient, me: Caller, arriving: str):
     beside = begun(client, me, 10, filename="b.tif", purpose="image", scene=arriving)
     assert (beside.status_code, "creates a new scene" in beside.json()["detail"]) == (422, True)
 
@@ -472,24 +459,22 @@ def test_an_image_does_not_join_a_scene(client: TestClient, me: dict[str, str], 
 @pytest.mark.parametrize("named", [{}, {"scene": str(UUID(int=1))}])
 def test_a_block_belongs_to_no_scene(client: TestClient, bearer: Bearer, named: dict[str, str]):
     me = bearer("admin") | TUS
-    block = shown(client, me, begun(client, me, 10, filename="a.zip", purpose="block", **named))
+    block = shown(me, begun(client, me, 10, filename="a.zip", purpose="block", **named))
     assert (block["purpose"], block.get("scene")) == ("block", None)
 
 
 @pytest.mark.parametrize("letters", [1, 195, 196, 197, 500])
 def test_of_a_long_name_the_last_two_hundred_letters_are_kept(
-    client: TestClient, me: dict[str, str], letters: int
+    client: TestClient, me: Caller, letters: int
 ):
     name = f"{'ab' * letters}"[:letters] + ".tif"
     reply = begun(client, me, 10, filename=name)
-    assert shown(client, me, reply)["name"] == name[-200:]
-    scene = client.get(f"/scenes/{reply.headers['amers-scene']}", headers=me).json()
+    assert shown(me, reply)["name"] == name[-200:]
+    scene = me.get(f"/scenes/{reply.headers['amers-scene']}").json()
     assert scene["name"] == name[-200:]
 
 
-def test_each_piece_gives_an_upload_another_day(
-    client: TestClient, me: dict[str, str], connection: Connection
-):
+def test_each_piece_gives_an_upload_another_day(client: TestClient, me: Caller, connection: Connection):
     def hours_left(reply: httpx.Response) -> float:
         expiry = parsedate_to_datetime(reply.headers["upload-expires"])
         return (expiry - datetime.now(UTC)).total_seconds() / 3600.0
@@ -501,14 +486,14 @@ def test_each_piece_gives_an_upload_another_day(
     for data in (TIFF[:10], b""):
         run_sql(connection, "update upload set expires_at = now() + interval '1 hour'")
         connection.commit()
-        start = int(client.head(url, headers=me).headers["upload-offset"])
+        start = int(me.head(url).headers["upload-offset"])
         assert piece(client, url, me, start, data).status_code == 204
-        assert hours_left(client.head(url, headers=me)) == pytest.approx(24.0, abs=0.1)
-        assert hours_left(client.head(other, headers=me)) == pytest.approx(1.0, abs=0.1)
+        assert hours_left(me.head(url)) == pytest.approx(24.0, abs=0.1)
+        assert hours_left(me.head(other)) == pytest.approx(1.0, abs=0.1)
 
 
 def test_the_largest_model_may_be_announced_and_the_largest_raster_as_an_image(
-    client: TestClient, me: dict[str, str]
+    client: TestClient, me: Caller
 ):
     scene = begun(client, me, LIMIT_BYTES, filename="a.tif").headers["amers-scene"]
     for name, most in (("a.xml", SIDE_FILE_LIMIT_BYTES), ("mask.tif", LIMIT_BYTES)):
@@ -517,39 +502,39 @@ def test_the_largest_model_may_be_announced_and_the_largest_raster_as_an_image(
 
 
 def test_a_model_that_does_not_arrive_leaves_the_scene_and_its_former_model(
-    client: TestClient, me: dict[str, str], storage: Storage
+    client: TestClient, me: Caller, storage: Storage
 ):
     scene = whole(client, me, TIFF, filename="a.tif").headers["amers-scene"]
     whole(client, me, b"former", filename="a_RPC.TXT", scene=scene)
     ended = begun(client, me, 4, filename="a_RPC.TXT", scene=scene).headers["location"]
-    assert client.delete(ended, headers=me).status_code == 204
+    assert me.delete(ended).status_code == 204
     wrong = whole(client, me, b"<a/>", filename="a_RPC.TXT", scene=scene, sha256="0" * 64)
     assert wrong.status_code == 422
-    document = client.get(f"/scenes/{scene}", headers=me).json()
+    document = me.get(f"/scenes/{scene}").json()
     assert (document["state"], document["models"]) == ("uploaded", ["a_RPC.TXT"])
     assert storage.open(f"scenes/{scene}/a_RPC.TXT").read() == b"former"
     assert list(storage.scratch().iterdir()) == []
 
 
 def test_the_model_that_an_administrator_sends_belongs_to_the_owner_of_the_scene(
-    client: TestClient, me: dict[str, str], bearer: Bearer
+    client: TestClient, me: Caller, bearer: Bearer
 ):
     scene = whole(client, me, TIFF, filename="a.tif").headers["amers-scene"]
     admin, stranger = bearer("admin") | TUS, bearer("register") | TUS
     assert begun(client, stranger, 4, filename="a.xml", scene=scene).status_code == 404
     url = begun(client, admin, 4, filename="a.xml", scene=scene).headers["location"]
-    assert client.head(url, headers=stranger).status_code == 404
+    assert stranger.head(url).status_code == 404
     assert piece(client, url, me, 0, b"<a/>").status_code == 204
-    assert client.get(f"/scenes/{scene}", headers=me).json()["models"] == ["a.xml"]
+    assert me.get(f"/scenes/{scene}").json()["models"] == ["a.xml"]
 
 
 def test_an_upload_whose_bytes_are_on_another_machine_has_to_begin_again(
-    client: TestClient, me: dict[str, str], storage: Storage
+    client: TestClient, me: Caller, storage: Storage
 ):
     url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
     (arriving,) = storage.scratch().iterdir()
     arriving.unlink()
-    for reply in (client.get(url, headers=me), piece(client, url, me, 0, TIFF)):
+    for reply in (me.get(url), piece(client, url, me, 0, TIFF)):
         assert reply.status_code == 404
         assert "start a new upload" in reply.json()["detail"]
 
@@ -566,17 +551,15 @@ def test_the_checksum_of_a_block_is_kept_whether_it_was_announced_or_not(
     assert row == {"sha256": sha256, "size_bytes": len(data)}
 
 
-def test_a_complete_upload_is_not_ended_with_its_scene(
-    client: TestClient, me: dict[str, str], storage: Storage
-):
+def test_a_complete_upload_is_not_ended_with_its_scene(client: TestClient, me: Caller, storage: Storage):
     url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
     scene = piece(client, url, me, 0, TIFF).headers["amers-scene"]
-    assert client.delete(url, headers=me).status_code == 409
-    assert client.get(f"/scenes/{scene}", headers=me).status_code == 200
+    assert me.delete(url).status_code == 409
+    assert me.get(f"/scenes/{scene}").status_code == 200
     assert storage.keys("scenes") == [f"scenes/{scene}/a.tif"]
 
 
-def test_a_complete_upload_takes_its_end_again_and_nothing_else(client: TestClient, me: dict[str, str]):
+def test_a_complete_upload_takes_its_end_again_and_nothing_else(client: TestClient, me: Caller):
     """The confirmation of the last piece may have been lost."""
     url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
     piece(client, url, me, 0, TIFF)
@@ -585,14 +568,14 @@ def test_a_complete_upload_takes_its_end_again_and_nothing_else(client: TestClie
     assert piece(client, url, me, len(TIFF) + 1, b"").status_code == 404
 
 
-def test_a_checksum_is_compared_in_small_letters_and_in_capitals(client: TestClient, me: dict[str, str]):
+def test_a_checksum_is_compared_in_small_letters_and_in_capitals(client: TestClient, me: Caller):
     for digest in (hashlib.sha256(TIFF).hexdigest(), hashlib.sha256(TIFF).hexdigest().upper()):
         assert whole(client, me, TIFF, filename="a.tif", sha256=digest).status_code == 204
 
 
 @pytest.mark.parametrize(("sigma_m", "status"), [("0", 422), ("-1", 422), ("inf", 422), ("0.1", 201)])
 def test_the_accuracy_of_a_model_is_a_number_of_metres_above_zero(
-    client: TestClient, me: dict[str, str], sigma_m: str, status: int
+    client: TestClient, me: Caller, sigma_m: str, status: int
 ):
     assert begun(client, me, 10, filename="a.tif", sigma_m=sigma_m).status_code == status
 
@@ -639,7 +622,7 @@ def test_the_archive_of_a_block_is_found_by_its_upload_and_no_other_file_is(
 
 
 def test_what_a_complete_upload_has_left_beside_its_file_is_removed(
-    client: TestClient, me: dict[str, str], storage: Storage
+    client: TestClient, me: Caller, storage: Storage
 ):
     arriving = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
     complete = begun(client, me, len(TIFF), filename="b.tif").headers["location"]
@@ -647,23 +630,23 @@ def test_what_a_complete_upload_has_left_beside_its_file_is_removed(
     name = f"{UPLOAD_PREFIX}{complete.rsplit('/', 1)[-1]}"
     (storage.scratch() / name).write_bytes(b"left by a service that was killed")
     assert remove_abandoned_uploads(client.app.state.database, storage) == [name]  # type: ignore[attr-defined]
-    assert client.head(arriving, headers=me).headers["upload-offset"] == "0"
+    assert me.head(arriving).headers["upload-offset"] == "0"
 
 
 def test_archives_are_stored_and_swept_alike_however_they_were_uploaded(
     client: TestClient, bearer: Bearer, storage: Storage, settings: Settings, dsn: str
 ):
     admin = bearer("admin")
-    put = client.put("/blocks/uploads/a.zip", content=b"PK\3\4" * 10, headers=admin).json()["upload"]
+    put = admin.put("/blocks/uploads/a.zip", content=b"PK\3\4" * 10).json()["upload"]
     reply = begun(client, admin | TUS, 40, filename="a.zip", purpose="block")
     tus = reply.headers["location"].rsplit("/", 1)[1]
     assert piece(client, reply.headers["location"], admin | TUS, 0, bytes(40)).status_code == 204
     keys = sorted(f"uploads/{upload}/a.zip" for upload in (put, tus))
     assert storage.keys("uploads") == keys
     execute = "/processes/ingest-block/execution"
-    job = client.post(execute, json={"inputs": {"upload": tus}}, headers=admin).json()["jobID"]
+    job = admin.post(execute, json={"inputs": {"upload": tus}}).json()["jobID"]
     for upload in (put, tus):
-        document = client.get(f"/uploads/{upload}", headers=admin).json()
+        document = admin.get(f"/uploads/{upload}").json()
         assert (document["state"], document["purpose"], document["size_bytes"]) == (
             "finished",
             "block",
@@ -678,8 +661,8 @@ def test_archives_are_stored_and_swept_alike_however_they_were_uploaded(
             let_pass(connection, hours=LIFE_HOURS + 1)
         sweep_files(database, storage, 3600.0)
         assert storage.keys("uploads") == [f"uploads/{tus}/a.zip"], "a job waits to ingest it"
-        assert client.delete(f"/jobs/{job}", headers=admin).status_code == 200
+        assert admin.delete(f"/jobs/{job}").status_code == 200
         sweep_files(database, storage, 3600.0)
     assert storage.keys("uploads") == []
-    gone = client.post(execute, json={"inputs": {"upload": put}}, headers=admin)
+    gone = admin.post(execute, json={"inputs": {"upload": put}})
     assert gone.status_code == 404

@@ -11,13 +11,14 @@ import shapely
 from fastapi.testclient import TestClient
 
 from amers.app.config import Settings
-from amers.app.db import registrations
 from amers.app.db.engine import Database
 from amers.app.db.jobs import jobs
 from amers.app.storage import Storage
 from amers.services.formats.vector.layers import read_layer
 from amers.services.map_grid import xy_of_lon_lat
 from amers.services.types import Frame
+from tests.app.callers import Bearer, Caller
+from tests.app.job_queue import store_registration
 from tests.app.ledger import job_runner, make_token
 from tests.app.test_orthorectification import in_the_image, write_inputs
 from tests.app.test_vectors import UTM, a_millimetre, drawn, on_ground, registered
@@ -32,29 +33,22 @@ Upload = Callable[[Path], None]
 
 
 @pytest.fixture
-def me(bearer: Callable[[str], dict[str, str]]) -> dict[str, str]:
-    return bearer("register")
-
-
-@pytest.fixture
-def run(client: TestClient, database: Database, settings: Settings, me: dict[str, str]) -> Run:
+def run(client: TestClient, database: Database, settings: Settings, me: Caller) -> Run:
     return job_runner(client, database, settings, me)
 
 
 @pytest.fixture
-def scene(client: TestClient, me: dict[str, str], tmp_path: Path) -> str:
+def scene(me: Caller, tmp_path: Path) -> str:
     """An uploaded scene with flat ground beside it."""
     image, dem = write_inputs(tmp_path)
-    scene: str = client.post("/scenes?name=scene.tif", content=image.read_bytes(), headers=me).json()[
-        "id"
-    ]
-    lay(client, me, scene, dem)
+    scene: str = me.scene(image.read_bytes())
+    lay(me, scene, dem)
     return scene
 
 
-def lay(client: TestClient, me: dict[str, str], scene: str, path: Path) -> None:
+def lay(me: Caller, scene: str, path: Path) -> None:
     """Upload a file beside the image of a scene."""
-    laid = client.put(f"/scenes/{scene}/files/{path.name}", content=path.read_bytes(), headers=me)
+    laid = me.put(f"/scenes/{scene}/files/{path.name}", content=path.read_bytes())
     assert laid.status_code == 200, laid.text
 
 
@@ -67,16 +61,7 @@ def registration(scene: str, storage: Storage, database: Database, tmp_path: Pat
     with database.transaction() as connection:
         job = jobs.create(connection, "register-scene", {})
         assert job is not None
-        registrations.insert_registration(
-            connection,
-            job_id=job.id,
-            scene_id=UUID(scene),
-            block_versions=[],
-            options={},
-            report={},
-            verdict="good",
-            files=keys,
-        )
+        store_registration(connection, job_id=job.id, scene_id=UUID(scene), files=keys)
     return str(job.id)
 
 
@@ -103,14 +88,14 @@ def results(
 
 def test_a_service_corrects_vectors_uploaded_beside_a_scene(
     client: TestClient,
-    me: dict[str, str],
+    me: Caller,
     run: Run,
     inputs: dict[str, object],
     registration: str,
     tmp_path: Path,
 ) -> None:
     lines = drawn(tmp_path / "drawn.geojson", "LINESTRING (100.5 -50.5, 300.5 -250.5)")
-    lay(client, me, str(inputs["scene"]), lines)
+    lay(me, str(inputs["scene"]), lines)
     ended = run("correct-vectors", **inputs, registration=registration, crs=UTM)
     answer, places = results(client, me, ended, tmp_path, "gpkg")
     assert (answer["features"], answer["vertices"], answer["left_out"]) == (1, 2, [])
@@ -136,15 +121,14 @@ def test_a_service_corrects_vectors_uploaded_beside_a_scene(
         ("project-vectors", {"options": {"tolerance_px": 0.0}}, "tolerance_px: 0 found, more than 0 px"),
         ("project-vectors", {"options": {"sigma_px": 1.0}}, "options.sigma_px: no such input"),
     ):
-        body = {"inputs": inputs | wrong}
-        refused = client.post(f"/processes/{process}/execution", json=body, headers=me)
+        refused = me.execute(process, inputs | wrong)
         assert refused.status_code == 422
         assert says in refused.json()["detail"]
 
 
 def test_vectors_of_the_map_come_into_a_registered_scene_and_back(
     client: TestClient,
-    me: dict[str, str],
+    me: Caller,
     run: Run,
     inputs: dict[str, object],
     registration: str,
@@ -157,7 +141,7 @@ def test_vectors_of_the_map_come_into_a_registered_scene_and_back(
         f"LINESTRING ({', '.join(f'{lon} {lat}' for lon, lat in lon_lat)})",
         f"POINT ({far[0]} {far[1]})",
     ]
-    lay(client, me, str(inputs["scene"]), drawn(tmp_path / "drawn.geojson", *wkt))
+    lay(me, str(inputs["scene"]), drawn(tmp_path / "drawn.geojson", *wkt))
     expected = np.column_stack([np.array(samples) + 0.5, -np.array(lines) - 0.5])
     for suffix in ("gpkg", "geojson"):
         ended = run("project-vectors", **inputs, registration=registration, format=suffix)
@@ -172,7 +156,7 @@ def test_vectors_of_the_map_come_into_a_registered_scene_and_back(
     # What came out goes in again, as the map page sends it.
     again = tmp_path / "again.geojson"
     again.write_bytes((tmp_path / "vectors.geojson").read_bytes())
-    lay(client, me, str(inputs["scene"]), again)
+    lay(me, str(inputs["scene"]), again)
     back = inputs | {"vectors": again.name}
     ended = run("correct-vectors", **back, registration=registration, format="geojson")
     places = results(client, me, ended, tmp_path, "geojson")[1]
@@ -188,12 +172,7 @@ def test_vectors_of_the_map_come_into_a_registered_scene_and_back(
     "crs", ["EPSG:5773", "EPSG:4978", "EPSG:999999", "urn:ogc:def:crs:IAU:2015:30100"]
 )
 def test_vectors_in_a_reference_system_that_is_no_map_end_the_job_with_its_name(
-    client: TestClient,
-    me: dict[str, str],
-    run: Run,
-    inputs: dict[str, object],
-    tmp_path: Path,
-    crs: str,
+    me: Caller, run: Run, inputs: dict[str, object], tmp_path: Path, crs: str
 ) -> None:
     lon, lat = on_ground(in_the_image(), [50], [100])[0]
     document = {
@@ -209,7 +188,7 @@ def test_vectors_in_a_reference_system_that_is_no_map_end_the_job_with_its_name(
     }
     path = tmp_path / "drawn.geojson"
     path.write_text(json.dumps(document))
-    lay(client, me, str(inputs["scene"]), path)
+    lay(me, str(inputs["scene"]), path)
     failed = run("project-vectors", **inputs)
     assert failed["status"] == "failed", str(failed)
     assert "reference system" in failed["error"]["detail"]
@@ -217,11 +196,11 @@ def test_vectors_in_a_reference_system_that_is_no_map_end_the_job_with_its_name(
 
 @pytest.mark.parametrize("process", ["correct-vectors", "project-vectors"])
 def test_a_stranger_cannot_use_a_scene_for_vectors(
-    client: TestClient, bearer: Callable[[str], dict[str, str]], tmp_path: Path, process: str
+    client: TestClient, bearer: Bearer, tmp_path: Path, process: str
 ) -> None:
     image, _ = write_inputs(tmp_path)
     owner, stranger = bearer("register"), make_token(client, bearer("admin"))
-    scene = client.post("/scenes?name=scene.tif", content=image.read_bytes(), headers=owner).json()["id"]
+    scene = owner.scene(image.read_bytes())
     body = {"inputs": {"scene": scene, "vectors": "a.geojson", "dem": "dem.tif"}}
     for headers, status in ((stranger, 404), (bearer("read"), 403), ({}, 401)):
         reply = client.post(f"/processes/{process}/execution", json=body, headers=headers)
@@ -230,7 +209,7 @@ def test_a_stranger_cannot_use_a_scene_for_vectors(
 
 def test_what_cannot_be_used_is_left_out_by_name_and_a_taken_name_is_changed(
     client: TestClient,
-    me: dict[str, str],
+    me: Caller,
     run: Run,
     inputs: dict[str, object],
     registration: str,
@@ -241,7 +220,7 @@ def test_what_cannot_be_used_is_left_out_by_name_and_a_taken_name_is_changed(
     document["features"][0]["properties"]["geom"] = "a name of mine"
     document["features"][1]["geometry"]["type"] = "Circle"
     lines.write_text(json.dumps(document))
-    lay(client, me, str(inputs["scene"]), lines)
+    lay(me, str(inputs["scene"]), lines)
     ended = run("correct-vectors", **inputs, registration=registration, crs=UTM)
     answer, _ = results(client, me, ended, tmp_path, "gpkg")
     assert (answer["features"], answer["left_out"]) == (2, [])

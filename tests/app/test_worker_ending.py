@@ -1,6 +1,5 @@
 """A worker that receives a signal ends, whatever its queue still runs."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -10,6 +9,7 @@ import pytest
 
 from amers.app.config import Settings
 from tests.app.worker_processes import wait_until
+from tests.command_line import environment_of
 
 PATIENCE_S = 60
 STUBBORN = """
@@ -59,11 +59,7 @@ main.run_worker(read_settings())
 def test_a_worker_ends_although_a_task_ignores_its_cancellation_or_a_thread_never_ends(
     settings: Settings, tmp_path: Path, program: str, code: int
 ) -> None:
-    assert settings.database_url is not None
-    environment = os.environ | {
-        "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
-        "AMERS_DATA_FOLDER": str(settings.data_folder),
-    }
+    environment = environment_of(settings)
     told = tmp_path / "told"
     with told.open("wb") as output:
         worker = subprocess.Popen([sys.executable, "-c", program], env=environment, stdout=output)

@@ -15,6 +15,7 @@ from fastapi.testclient import TestClient
 from amers.app.config import Settings
 from amers.app.storage import Storage
 from tests.app.flat_world import SIGMA_M, FlatWorld, publish_world
+from tests.command_line import environment_of
 
 PATIENCE_S = 240.0
 ENDED = ("successful", "failed", "dismissed")
@@ -30,10 +31,7 @@ def running_worker(
         prefix: the command that runs it, as `ip netns exec NAME`.
         more: of its environment.
     """
-    assert settings.database_url is not None
-    environment = os.environ | {
-        "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
-        "AMERS_DATA_FOLDER": str(settings.data_folder),
+    environment = environment_of(settings) | {
         "AMERS_LEASE_SECONDS": str(settings.lease_seconds),
         "AMERS_JOB_SECONDS": str(settings.job_seconds),
         "AMERS_JOB_MEMORY_BYTES": str(settings.job_memory_bytes),

@@ -18,6 +18,7 @@ from amers.app.storage import Storage
 from amers.app.usecases import results
 from amers.app.usecases.jobs import PROCESSES, error_details
 from amers.services.errors import NotEnoughPoints
+from tests.app.callers import Caller
 from tests.app.job_queue import claim
 from tests.statements import run_sql
 
@@ -57,24 +58,19 @@ LAYERS = bytes(range(256))
 
 
 @pytest.fixture
-def me(bearer: Callable[[str], dict[str, str]]) -> dict[str, str]:
-    return bearer("register")
-
-
-@pytest.fixture
-def get(client: TestClient, me: dict[str, str]) -> Callable[..., Any]:
+def get(me: Caller) -> Callable[..., Any]:
     """GET with scope `register`."""
-    return lambda path, **query: client.get(path, params=query or None, headers=me)
+    return lambda path, **query: me.get(path, params=query or None)
 
 
 @pytest.fixture
-def scene(client: TestClient, me: dict[str, str]) -> str:
-    reply = client.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100), headers=me)
+def scene(me: Caller) -> str:
+    reply = me.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100))
     return str(reply.json()["id"])
 
 
 @pytest.fixture
-def ask(client: TestClient, me: dict[str, str], scene: str) -> Callable[..., Any]:
+def ask(client: TestClient, me: Caller, scene: str) -> Callable[..., Any]:
     """Executes a registration; members of the body by name."""
 
     def ask(prefer: str | None = None, **more: Any) -> Any:
@@ -202,9 +198,9 @@ def assert_described(told: dict[str, Any], name: str) -> None:
     assert href(told, f"{OGC}execute").endswith(f"/processes/{name}/execution")
 
 
-def test_req_core_process_exception_no_such_process(client, get, me):
+def test_req_core_process_exception_no_such_process(get, me):
     assert_exception(get("/processes/paint"), 404, "no-such-process")
-    reply = client.post("/processes/paint/execution", json={"inputs": {}}, headers=me)
+    reply = me.execute("paint", {})
     assert_exception(reply, 404, "no-such-process")
 
 
@@ -228,9 +224,9 @@ def test_req_core_process_execute_default_execution_mode(ask):
         assert "preference-applied" not in reply.headers
 
 
-def test_req_core_process_execute_inputs(client, me, scene):
+def test_req_core_process_execute_inputs(me, scene):
     def posted(value: Any) -> Any:
-        return client.post(EXECUTE, json={"inputs": {"scene": value}}, headers=me)
+        return me.post(EXECUTE, json={"inputs": {"scene": value}})
 
     for said in (
         scene,
@@ -274,11 +270,11 @@ def test_req_core_job_success(get, ask, dsn):
     assert told["created"] <= told["started"] <= told["updated"]
 
 
-def test_req_core_job_exception_no_such_job(client, get, me):
+def test_req_core_job_exception_no_such_job(get, me):
     for job in (str(uuid4()), "none", "1"):
         for path in (f"/jobs/{job}", f"/jobs/{job}/results", f"/jobs/{job}/messages"):
             assert_exception(get(path), 404, "no-such-job")
-        assert_exception(client.delete(f"/jobs/{job}", headers=me), 404, "no-such-job")
+        assert_exception(me.delete(f"/jobs/{job}"), 404, "no-such-job")
 
 
 # Results
@@ -426,11 +422,11 @@ def test_req_job_list_parameters(get, ask, dsn):
 # Dismiss
 
 
-def test_req_dismiss_job_dismiss_success(client, get, ask, me, dsn):
+def test_req_dismiss_job_dismiss_success(get, ask, me, dsn):
     waiting, running = (ask().json() for _ in range(2))
     begun(dsn, running["jobID"])
     for job in (waiting, running):
-        reply = client.delete(f"/jobs/{job['jobID']}", headers=me)
+        reply = me.delete(f"/jobs/{job['jobID']}")
         assert reply.status_code == 200
         validate(reply.json(), STATUS_INFO)
         assert reply.json()["status"] == "dismissed"
