@@ -36,7 +36,7 @@ class NamedFile:
 
 
 def read_named_files(connection: Connection, keys: list[str] | None = None) -> list[NamedFile]:
-    """The files that rows name, by key; with `keys`, those of them that rows name."""
+    """The files that rows refer to, by key; with `keys`, only files among these."""
     return every(NamedFile, connection.execute(NAMED_FILES, {"keys": keys}))
 
 

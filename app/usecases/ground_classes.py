@@ -16,7 +16,8 @@ UNSTEADY = ("water", "snow and ice")
 
 @dataclass(frozen=True)
 class GroundFiles:
-    """Files about the ground of a block. Classes of ESA WorldCover have names, those of others numbers.
+    """Files about the ground of a block. Classes of ESA WorldCover have names, other classes have
+    numbers.
 
     Attributes:
         exclude: ground without points: GeoJSON polygons, or an image on a map; repeat for several.

@@ -268,7 +268,7 @@ def _damaged_rows(recorded: bytes | None, content: Content | None) -> list[int] 
 
 
 def _unknown(database: Database, storage: Storage) -> list[Finding]:
-    """Files that no row names, without those that are being written and those that the sweep removes."""
+    """Files without a row, except files that are being written and files that the sweep removes."""
     with database.transaction() as connection:
         blocks.lock_sweep(connection)
         families = garbage_collection.compare_files(connection, storage)

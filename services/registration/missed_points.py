@@ -1,8 +1,8 @@
 """Lines and samples whose points were missed, searched again farther out.
 
 The last search reaches a few pixels. Where lines were lost or repeated, or the sensor oscillates by
-more, all points of some lines lie beyond it, while those of other lines are found; so do those of the
-samples of a detector that is out of place. Clouds hide points; they do not move them.
+more, all points of some lines lie beyond it, while points of other lines are found. The same happens to
+the samples of a detector that is out of place. Clouds hide points; they do not move them.
 """
 
 from dataclasses import replace
