@@ -25,9 +25,10 @@ from typing import Any
 import httpx
 import numpy as np
 
+from amers.app.usecases import report_files
 from amers.app.usecases.image_production import ProductionImages, run_image_production
 from amers.app.usecases.new_block import BlockIdentity
-from amers.app.usecases.registration import deliverables, register
+from amers.app.usecases.registration import register
 from amers.app.usecases.registration.control_sources import points_of_block
 from amers.app.usecases.registration.register import ControlSources, SceneFiles, run_registration
 from amers.services.formats.block.reader import FolderChips, read_block
@@ -162,7 +163,7 @@ def _timed(stages: dict[str, float]) -> Iterator[None]:
         (register, "write_refined", "refit"),
         (register, "figure_data", "figure data"),
         (register, "write_outputs", "deliverables"),
-        (deliverables, "format_html", "page"),
+        (report_files, "format_html", "page"),
     )
 
     def timed(function: Callable[..., Any], stage: str) -> Callable[..., Any]:

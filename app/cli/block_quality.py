@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from amers.app.cli.exit_status import NO_RESULT
 from amers.app.cli.options import FromMilli, Shown
@@ -31,11 +30,9 @@ from amers.services.formats.block.document_json import BLOCK_JSON
 from amers.services.quality.accuracy_statement import accuracy_document
 from amers.services.quality.block import BlockQuality, Distribution, quality_document
 from amers.services.reports.block_quality import BlockQualityReport
-from amers.services.reports.block_quality_pages import quality_tables
+from amers.services.reports.block_quality_pages import QUALITY_PAGE
 from amers.services.reports.document import report_document
-
-_TABLE_WIDTH = 110
-
+from amers.services.reports.text import print_text
 
 _Files = list[Path] | None
 References = Annotated[
@@ -160,9 +157,7 @@ def _show_report(report: BlockQualityReport, output: Path | None, *, as_json: bo
     if as_json:
         print_json(report_document(report))
         return
-    console = Console(width=None if Console().is_terminal else _TABLE_WIDTH)
-    for table in quality_tables(report):
-        console.print(table)
+    print_text(QUALITY_PAGE, report)
     typer.echo(f"{report.verdict}: {report.verdict_words}")
     if output is not None:
         typer.echo(str(output / "block_quality.html"))

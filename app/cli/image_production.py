@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from amers.app.cli.control_options import ControlOptions
 from amers.app.cli.options import FromCenti, Shown
@@ -22,12 +21,12 @@ from amers.app.usecases.image_selection import CatalogueRequest, run_selection
 from amers.app.usecases.new_block import BlockIdentity, refuse_existing
 from amers.services.formats.addresses import file_place
 from amers.services.production.image_production import Production, ProductionOptions
-from amers.services.reports.block_adjustment_pages import adjustment_table
+from amers.services.reports.block_adjustment_pages import IMAGES_PAGE
+from amers.services.reports.text import print_text
 from amers.services.types import Progress, part_of
 
 _DEFAULT = ProductionOptions()
 _SHARE_OF_SELECTION = 0.05
-_TABLE_WIDTH = 140
 
 
 @dataclass(frozen=True)
@@ -137,9 +136,7 @@ def run(
             progress=part_of(progress, _SHARE_OF_SELECTION, 1.0 - _SHARE_OF_SELECTION),
         )
     if not as_json:
-        Console(width=None if Console().is_terminal else _TABLE_WIDTH).print(
-            adjustment_table(production.image_fits)
-        )
+        print_text(IMAGES_PAGE, production.image_fits)
     show_one(_row(production, output, as_json=as_json), as_json=as_json)
 
 

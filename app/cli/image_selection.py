@@ -6,19 +6,18 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from amers.app.cli.output import AsJson, print_json
 from amers.app.cli.progress import shown_progress
 from amers.app.errors import InputError
 from amers.app.usecases.image_selection import CatalogueRequest, run_selection
 from amers.services.production.image_selection import SelectionOptions
-from amers.services.reports.selection import selection_document
-from amers.services.reports.selection_pages import selection_tables
+from amers.services.reports.document import report_document
+from amers.services.reports.selection_pages import SELECTION_PAGE
+from amers.services.reports.text import print_text
 
 _DEFAULT = SelectionOptions()
 _DEFAULT_LIMITS = ",".join(f"{limit:g}" for limit in _DEFAULT.cloud_limits_percent)
-_TABLE_WIDTH = 100
 
 
 def select(
@@ -64,11 +63,9 @@ def select(
     with shown_progress() as progress:
         report = run_selection(CatalogueRequest(catalogue, area, first_day), output, options, progress)
     if as_json:
-        print_json(selection_document(report))
+        print_json(report_document(report))
         return
-    console = Console(width=None if Console().is_terminal else _TABLE_WIDTH)
-    for table in selection_tables(report):
-        console.print(table)
+    print_text(SELECTION_PAGE, report)
     above = f"{100.0 * report.above_bound:.1f} %"
     typer.echo(
         f"{report.use.selected:,} images chosen, {above} above the lower bound of {report.bound:,}; "

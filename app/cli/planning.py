@@ -4,15 +4,13 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from amers.app.cli.output import AsJson, print_json
 from amers.app.cli.progress import shown_progress
 from amers.app.usecases.planning import run_plan
-from amers.services.reports.plan import plan_document
-from amers.services.reports.plan_pages import plan_tables
-
-_TABLE_WIDTH = 100
+from amers.services.reports.document import report_document
+from amers.services.reports.plan_pages import PLAN_PAGE
+from amers.services.reports.text import print_text
 
 
 def plan(
@@ -35,11 +33,9 @@ def plan(
     with shown_progress() as progress:
         report = run_plan(configuration, output, selection, progress)
     if as_json:
-        print_json(plan_document(report))
+        print_json(report_document(report))
         return
-    console = Console(width=None if Console().is_terminal else _TABLE_WIDTH)
-    for table in plan_tables(report):
-        console.print(table)
+    print_text(PLAN_PAGE, report)
     for line in report.words:
         typer.echo(line)
     typer.echo(str(output / "report.html"))

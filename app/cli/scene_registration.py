@@ -25,7 +25,7 @@ from amers.app.errors import AmersError, ComputationError, InputError
 from amers.app.usecases import storage_identity
 from amers.app.usecases.references import references_of_store
 from amers.app.usecases.registration.control_sources import points_of_block, points_of_store
-from amers.app.usecases.registration.failure import FAILURE_OUTPUTS, Attempt, write_failure
+from amers.app.usecases.registration.failure import Attempt, write_failure
 from amers.app.usecases.registration.reference_source import ReferenceFiles, given_reference
 from amers.app.usecases.registration.register import (
     ControlSources,
@@ -36,6 +36,7 @@ from amers.app.usecases.registration.register import (
     run_registration,
 )
 from amers.app.usecases.registration.result_folder import older_result, replacing
+from amers.app.usecases.report_files import REPORT_FILES
 from amers.app.usecases.uploads import IMAGE_SUFFIXES
 from amers.app.worker.warm_process import WarmProcess, WarmServer
 from amers.services.quality.accuracy_statement import accuracy_document
@@ -193,7 +194,7 @@ def outcome_of(
 def _keep_only_failure(request: SceneRequest, new: Path, error: AmersError) -> None:
     """Leave nothing but the report of a failure in a new folder."""
     for path in new.iterdir():
-        if path.name not in FAILURE_OUTPUTS:
+        if path.name not in REPORT_FILES:
             path.unlink()
     if not (new / "report.json").exists():
         attempt = Attempt(request.files.image, request.command, RegistrationOptions())

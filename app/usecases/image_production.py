@@ -1,7 +1,6 @@
 """Make a block of points from overlapping images: given as files, or chosen from a catalogue."""
 
 import hashlib
-import json
 import pickle
 import shutil
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ from amers.app.usecases.ground_classes import GroundFiles, read_ground
 from amers.app.usecases.image_selection import ITEMS
 from amers.app.usecases.new_block import BlockIdentity, block_metadata, points_per_km2, refuse_existing
 from amers.app.usecases.registration.result_folder import replacing
+from amers.app.usecases.report_files import write_report
 from amers.services.adjustment.known_images import KnownImages
 from amers.services.errors import FormatError
 from amers.services.formats.addresses import Address, FilePlace
@@ -30,8 +30,8 @@ from amers.services.formats.stac.scenes import image_place, read_item_scene
 from amers.services.formats.work_folder import WorkFolder
 from amers.services.imagery.scene import Scene
 from amers.services.production.image_production import Production, ProductionOptions, produce_points
-from amers.services.reports.block_adjustment import adjustment_document, adjustment_report, points_csv
-from amers.services.reports.block_adjustment_pages import format_adjustment_html
+from amers.services.reports.block_adjustment import adjustment_report, points_csv
+from amers.services.reports.block_adjustment_pages import ADJUSTMENT_PAGE
 from amers.services.sensors.refined import refined_rpc
 from amers.services.sensors.rpc import RpcModel
 from amers.services.tasks import Work
@@ -135,9 +135,7 @@ def _write_report(folder: Path, block: str, production: Production) -> None:
         block, production, finished_at=datetime.now(UTC), software_version=version("amers")
     )
     with replacing(folder) as new:
-        document = json.dumps(adjustment_document(report), indent=2, allow_nan=False)
-        (new / "report.json").write_text(document + "\n", encoding="utf-8")
-        (new / "report.html").write_text(format_adjustment_html(report), encoding="utf-8")
+        write_report(new, ADJUSTMENT_PAGE, report)
         if production.adjustment.known is not None:
             write_adjusted_images(new / IMAGES_NPZ, block, production.adjustment.known)
         (new / "points.csv").write_text(points_csv(report), encoding="utf-8")

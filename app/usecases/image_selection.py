@@ -1,6 +1,5 @@
 """Select images from a catalogue: read it, call the science, write selection, cells and report."""
 
-import json
 import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -11,6 +10,7 @@ import numpy as np
 import shapely
 
 from amers.app.usecases.registration.result_folder import replacing
+from amers.app.usecases.report_files import write_report
 from amers.services.formats.addresses import without_query
 from amers.services.formats.stac.catalogue import StacCatalogue, parse_area, read_catalogue
 from amers.services.formats.stac.writer import write_items
@@ -21,10 +21,9 @@ from amers.services.reports.selection import (
     SelectionReport,
     SourceFacts,
     overlap_csv,
-    selection_document,
     selection_report,
 )
-from amers.services.reports.selection_pages import format_selection_html
+from amers.services.reports.selection_pages import SELECTION_PAGE
 from amers.services.types import Progress, no_progress, part_of
 
 ITEMS, CELLS, OVERLAP = "selection.json", "cells.gpkg", "overlap.csv"
@@ -120,6 +119,4 @@ def _write_files(
         },
     )
     (folder / OVERLAP).write_text(overlap_csv(report), encoding="utf-8")
-    (folder / "report.html").write_text(format_selection_html(report, selection), encoding="utf-8")
-    document = json.dumps(selection_document(report), indent=2, default=str, allow_nan=False)
-    (folder / "report.json").write_text(document + "\n", encoding="utf-8")
+    write_report(folder, SELECTION_PAGE, report)

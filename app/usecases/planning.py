@@ -1,6 +1,5 @@
 """Predict the accuracy of a block from a plan: read it, call the science, write the report."""
 
-import json
 import time
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -13,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from amers.app.errors import InputError
 from amers.app.usecases.registration.result_folder import replacing
+from amers.app.usecases.report_files import write_report
 from amers.services.formats.stac.catalogue import read_catalogue
 from amers.services.formats.text_files import load_json, read_text
 from amers.services.geodesy import metres_per_degree
@@ -25,8 +25,8 @@ from amers.services.production.block_plan import (
     SiteSigmas,
 )
 from amers.services.production.planning import forecast
-from amers.services.reports.plan import PlanReport, plan_document, points_csv
-from amers.services.reports.plan_pages import format_plan_html
+from amers.services.reports.plan import PlanReport, points_csv
+from amers.services.reports.plan_pages import PLAN_PAGE
 from amers.services.types import Progress, no_progress
 
 _MAX_CANDIDATES = 200
@@ -118,9 +118,7 @@ def run_plan(
             datetime.now(UTC),
             version("amers"),
         )
-        document = json.dumps(plan_document(report), indent=2, allow_nan=False)
-        (new / "report.json").write_text(document + "\n", encoding="utf-8")
-        (new / "report.html").write_text(format_plan_html(report), encoding="utf-8")
+        write_report(new, PLAN_PAGE, report)
         (new / "points.csv").write_text(points_csv(report), encoding="utf-8")
     progress(1.0, "done")
     return report

@@ -1,6 +1,6 @@
 """Content of the report on the adjustment of a block: its images, its control, its points."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
@@ -86,6 +86,26 @@ class AdjustmentReport:
         )
         return f"{' and '.join(parts)}."
 
+    def document(self) -> dict[str, Any]:
+        """Members of the JSON document, without the points."""
+        return {
+            "format": FORMAT,
+            "block": {"id": self.block},
+            "verdict": self.verdict,
+            "verdict_words": self.verdict_words,
+            **accuracy_document(self.accuracy),
+            "residuals_px": {
+                "delivered": self.delivered_px,
+                "adjusted": self.adjusted_px,
+                "points": self.points_px,
+            },
+            "slope_factor": self.slope_factor,
+            "images": self.images,
+            "control": self.control,
+            "finished_at": self.finished_at,
+            "software_version": self.software_version,
+        }
+
 
 def adjustment_report(
     block: str, production: Production, *, finished_at: datetime, software_version: str
@@ -120,30 +140,6 @@ def adjustment_report(
         finished_at=finished_at,
         software_version=software_version,
     )
-
-
-def adjustment_document(report: AdjustmentReport) -> dict[str, Any]:
-    """The report as JSON values, without the points."""
-    return {
-        "format": FORMAT,
-        "block": {"id": report.block},
-        "verdict": report.verdict,
-        "verdict_words": report.verdict_words,
-        **accuracy_document(report.accuracy),
-        "residuals_px": {
-            "delivered": report.delivered_px,
-            "adjusted": report.adjusted_px,
-            "points": report.points_px,
-        },
-        "slope_factor": report.slope_factor,
-        "images": [asdict(image) for image in report.images],
-        "control": [
-            {**asdict(one), "misfit_m": [None if v != v else v for v in one.misfit_m]}
-            for one in report.control
-        ],
-        "finished_at": report.finished_at.isoformat(),
-        "software_version": report.software_version,
-    }
 
 
 def points_csv(report: AdjustmentReport) -> str:

@@ -7,7 +7,14 @@ import numpy as np
 from amers.services.geodesy import metres_per_degree
 from amers.services.quality.block import HALF_PER_KM2, QUARTER_PER_KM2
 from amers.services.reports.block_quality import BlockQualityReport
-from amers.services.reports.drawing import ACTIVE, DEACTIVATED, crowding, round_number
+from amers.services.reports.drawing import (
+    ACTIVE,
+    DEACTIVATED,
+    crowding,
+    legend,
+    rgb_values,
+    round_number,
+)
 from amers.services.reports.maps import equal_panel
 from amers.services.reports.plot import (
     INK,
@@ -30,7 +37,10 @@ _ABOVE, _BELOW = "#c0392b", "#2f6fb0"
 
 
 def density_map(report: BlockQualityReport) -> Figure:
-    """The density of the cells of 0.1 degree against what is specified, else 1 point / 2 and / 4 km2."""
+    """The density of the cells of 0.1 degree against what is specified, else 1 point / 2 and / 4 km2.
+
+    Density by cells of 0.1 degree, on ground inside the outline that is not excluded.
+    """
     density = np.array([cell.points_per_km2 for cell in report.density.cells])
     required = report.requirements.points_per_km2
     if required is None:
@@ -46,7 +56,10 @@ def density_map(report: BlockQualityReport) -> Figure:
 
 
 def views_map(report: BlockQualityReport) -> Figure:
-    """The median number of images of the points in each cell of 0.1 degree."""
+    """The median number of images of the points in each cell of 0.1 degree.
+
+    Median number of images that show a point, by cells of 0.1 degree.
+    """
     images = np.array([cell.images for cell in report.density.cells])
     needed = report.requirements.min_views
     shades = ("#7b241c", "#d9776c", "#cfe0f1", "#9fc4e8", "#5f9bd6", "#23588f")
@@ -60,7 +73,11 @@ def views_map(report: BlockQualityReport) -> Figure:
 
 
 def height_histogram(report: BlockQualityReport) -> Figure:
-    """Distribution of the height errors, cut at the ends, with LE90 on both sides."""
+    """Distribution of the height errors, cut at the ends, with LE90 on both sides.
+
+    Height of the points minus that of the model; the ends hold all farther points. 90 % lie between
+    the orange lines.
+    """
     figure = Figure(176.0)
     errors = report.errors.heights
     if errors is None or report.heights is None or not len(errors.error_m):
@@ -87,7 +104,10 @@ def height_histogram(report: BlockQualityReport) -> Figure:
 
 
 def height_map(report: BlockQualityReport) -> Figure:
-    """The points by their height error: red above the model, blue below, pale within half of LE90."""
+    """The points by their height error: red above the model, blue below, pale within half of LE90.
+
+    Points by the error of their heights.
+    """
     figure = Figure(300.0)
     errors = report.errors.heights
     if errors is None or report.heights is None or not len(errors.error_m):
@@ -111,7 +131,11 @@ def height_map(report: BlockQualityReport) -> Figure:
 
 
 def error_scatter(report: BlockQualityReport) -> Figure:
-    """Planimetric errors, east and north, of the first source; the circle holds 90 %."""
+    """Planimetric errors, east and north, of the first source; the circle holds 90 %.
+
+    Errors east and north: blue at check-only sites, orange at control sites. The circle holds 90 %
+    of all.
+    """
     figure = Figure(330.0)
     if not report.planimetry:
         return _nothing(figure)
@@ -140,7 +164,10 @@ def error_scatter(report: BlockQualityReport) -> Figure:
 
 
 def site_map(report: BlockQualityReport) -> Figure:
-    """The sites in the outline of the block, with their mean errors as arrows, enlarged."""
+    """The sites in the outline of the block, with their mean errors as arrows, enlarged.
+
+    Mean error of each site, enlarged, in the outline of the block.
+    """
     figure = Figure(300.0)
     if not report.planimetry:
         return _nothing(figure)
@@ -184,9 +211,10 @@ def _cell_map(report: BlockQualityReport, kind: IntArray, colours: Sequence[str]
     index = np.rint((corner - [west, south]) * 10.0).astype(int)
     across, up = (index.max(axis=0) + 1).tolist()
     pixels = np.zeros((up, across, 4), dtype=np.uint8)
-    rgb = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in colours], dtype=np.uint8)
     opaque = np.full((len(cells), 1), 255, dtype=np.uint8)
-    pixels[up - 1 - index[:, 1], index[:, 0]] = np.concatenate([rgb[kind], opaque], axis=1)
+    pixels[up - 1 - index[:, 1], index[:, 0]] = np.concatenate(
+        [rgb_values(colours)[kind], opaque], axis=1
+    )
     factor = max(1, _PIXELS_ACROSS // across)
     with panel.clipped():
         whole = Panel(
@@ -250,11 +278,7 @@ def _continuous(lon_lat: Array, outline: Array) -> Array:
 
 
 def _legend(figure: Figure, entries: Sequence[tuple[str, str]]) -> None:
-    """Write names with boxes of their colours at the foot of a figure, in rows of three."""
+    """Write names with boxes of their colours at the foot of a figure, which grows with their rows."""
     rows = (len(entries) + 2) // 3
     figure.height += 12.0 * max(0, rows - 1)
-    for k, (name, colour) in enumerate(entries):
-        x = 52.0 + (k % 3) * (WIDTH - 60.0) / 3.0
-        y = figure.height - 12.0 * (rows - k // 3) + 6.0
-        figure.box((x, y - 7.0), (9.0, 8.0), colour)
-        figure.text(x + 13.0, y, name, size=SMALL_TEXT)
+    legend(figure, figure.height - 12.0 * rows + 6.0, entries)

@@ -35,7 +35,11 @@ _BAR_LABELS = 130.0
 
 
 def residual_histograms(report: RegistrationReport) -> Figure:
-    """Distribution of the residuals of the active points in x, y and xy."""
+    """Distribution of the residuals of the active points in x, y and xy.
+
+    Distribution of the residuals; the line is the mean, the title mean ± standard deviation in
+    pixels.
+    """
     figure = Figure(166.0)
     measures = report.figure_data.measures
     line, sample = measures.residual_px[measures.active].T
@@ -66,7 +70,10 @@ def residual_histograms(report: RegistrationReport) -> Figure:
 
 
 def funnel(report: RegistrationReport) -> Figure:
-    """Visible, matched and active points, with the points lost between them by reason."""
+    """Visible, matched and active points, with the points lost between them by reason.
+
+    From visible to matched to active points; the points lost between them, by reason.
+    """
     counts = report.point_counts
     bars: list[tuple[str, int, int, str]] = [("visible", 0, counts.visible, QUIET)]
     remaining = counts.visible
@@ -98,7 +105,11 @@ def funnel(report: RegistrationReport) -> Figure:
 
 
 def residuals_along(report: RegistrationReport) -> Figure:
-    """Residuals of the active points against line and sample: drift and jitter show here."""
+    """Residuals of the active points against line and sample: drift and jitter show here.
+
+    Residuals along lines and samples; orange: running median. A slope shows a drift that the
+    correction does not remove, a wave along the lines shows jitter of the platform.
+    """
     figure = Figure(274.0)
     measures = report.figure_data.measures
     residual, place = measures.residual_px[measures.active], measures.line_sample[measures.active]
@@ -123,7 +134,11 @@ def residuals_along(report: RegistrationReport) -> Figure:
 
 
 def displacement(report: RegistrationReport) -> Figure:
-    """What the correction follows beyond an affine one, and what points show of it."""
+    """What the correction follows beyond an affine one, and what points show of it.
+
+    What the correction follows beyond an affine one (orange, with twice its standard deviation), and
+    what the active points show of it.
+    """
     figure = Figure(274.0)
     sections, measures = report.figure_data.sections, report.figure_data.measures
     if not sections:
@@ -152,7 +167,12 @@ def displacement(report: RegistrationReport) -> Figure:
 
 
 def residuals_by_height(report: RegistrationReport) -> Figure:
-    """Residuals of the active points on the ground against their height, along and across the view."""
+    """Residuals of the active points on the ground against their height, along and across the view.
+
+    Residuals on the ground against the height of the points. A slope along the view shows an error
+    of the heights, of the points or of the terrain they come from; across the view no slope is
+    expected.
+    """
     figure = Figure(188.0)
     measures = report.figure_data.measures
     azimuth = np.radians(report.scene.acquisition.azimuth_deg)

@@ -1,7 +1,8 @@
 """`report.json` and `block_quality.json`: reports as documents, and the JSON Schemas that describe them.
 
-Both follow the dataclasses of the report: a field is a member of the same name, a value that could not
-be computed is null, and the descriptions are those of the docstrings.
+They follow the dataclasses of the report, but for plans, selections and adjustments: a field is a member
+of the same name, and the descriptions are those of the docstrings. A value that could not be computed is
+null.
 """
 
 import inspect
@@ -10,7 +11,16 @@ import math
 import types
 from dataclasses import Field, fields, is_dataclass
 from datetime import datetime
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Any,
+    Literal,
+    Protocol,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+    runtime_checkable,
+)
 
 import numpy as np
 
@@ -20,7 +30,16 @@ from amers.services.reports.failure import FAILURE_FORMAT, FailureReport
 from amers.services.reports.joint import JOINT_FORMAT, JointReport
 from amers.services.reports.report import NOT_IN_JSON, REPORT_FORMAT, RegistrationReport
 
-Report = RegistrationReport | FailureReport | BlockQualityReport | JointReport
+
+@runtime_checkable
+class WithDocument(Protocol):
+    """A report whose document has other members than its dataclass."""
+
+    def document(self) -> dict[str, Any]:
+        """Members of the document."""
+
+
+Report = RegistrationReport | FailureReport | BlockQualityReport | JointReport | WithDocument
 Json = None | bool | int | float | str | list[Any] | dict[str, Any]
 
 
@@ -31,6 +50,8 @@ def format_report(report: Report) -> str:
 
 def report_document(report: Report) -> dict[str, Any]:
     """The report as plain JSON values; numbers that are not finite become null."""
+    if isinstance(report, WithDocument):
+        return {name: _plain(value) for name, value in report.document().items()}
     return {field.name: _plain(getattr(report, field.name)) for field in _members(type(report))}
 
 

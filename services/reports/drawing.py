@@ -1,11 +1,14 @@
 """What the figures of a report share: palette, sizes of marks, and the scene under the marks."""
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from amers.services.conventions import STATUS_COLOURS
 from amers.services.reports.figure_data import Quicklook
-from amers.services.reports.plot import WIDTH, Figure, Panel
+from amers.services.reports.plot import SMALL_TEXT, WIDTH, Figure, Panel
 from amers.services.reports.report import RegistrationReport
 from amers.services.types import Array, BoolArray, FloatImage
 
@@ -86,6 +89,19 @@ def _stretched(pixels: FloatImage, opaque: BoolArray) -> Array:
 def crowding(n: int) -> float:
     """Factor, at most 1, by which the size of n marks is reduced so that they do not overlap much."""
     return float(np.sqrt(min(1.0, _UNCROWDED / max(n, 1))))
+
+
+def rgb_values(colours: Sequence[str]) -> npt.NDArray[np.uint8]:
+    """Red, green and blue (n, 3) of colours such as "#7fb2e5"."""
+    return np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in colours], dtype=np.uint8)
+
+
+def legend(figure: Figure, top: float, entries: Sequence[tuple[str, str]]) -> None:
+    """Write names beside boxes of their colours, in rows of three from a height of the figure down."""
+    for k, (name, colour) in enumerate(entries):
+        x, y = 52.0 + (k % 3) * (WIDTH - 60.0) / 3.0, top + 12.0 * (k // 3)
+        figure.box((x, y - 7.0), (9.0, 8.0), colour)
+        figure.text(x + 13.0, y, name, size=SMALL_TEXT)
 
 
 def round_number(value: float) -> float:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from amers.services.geodesy import metres_per_degree
+from amers.services.geodesy import metres_per_degree, wrapped_degrees
 from amers.services.reports.drawing import (
     ACTIVE,
     ARROW,
@@ -35,22 +35,18 @@ _PALE, _DEEP = np.array([247.0, 251.0, 255.0]), np.array([0.0, 92.0, 190.0])
 
 
 def ground_overview(report: RegistrationReport) -> Figure:
-    """The footprint of the scene and its points, kilometres east and north of its middle."""
-    figure = Figure(272.0)
+    """The footprint of the scene and its points, kilometres east and north of its middle.
+
+    Footprint of the scene and its points: blue active, orange deactivated, grey not matched.
+    """
     outline, measures = report.scene.footprint_lon_lat, report.figure_data.measures
     places = outline if len(outline) else measures.lon_lat_h[:, :2]
     centre = places.mean(axis=0) if len(places) else np.zeros(2)
-    km = np.array(metres_per_degree(float(centre[1]), 0.0)) / 1000.0
-    offset = measures.lon_lat_h[:, :2] - centre
-    offset[:, 0] = (offset[:, 0] + 180.0) % 360.0 - 180.0
-    points_km, outline_km = offset * km, (outline - centre) * km
-    panel = equal_panel(figure, np.concatenate([points_km, outline_km]))
-    panel.x_axis("km east", count=8, grid=True)
-    panel.y_axis("km north", grid=True)
+    points_km, outline_km = (kilometres(one, centre) for one in (measures.lon_lat_h[:, :2], outline))
+    panel = ground_panel(272.0, np.concatenate([points_km, outline_km]))
+    figure = panel.figure
     if len(outline):
-        ring = panel.places(*np.concatenate([outline_km, outline_km[:1]]).T)
-        figure.area(ring, ACTIVE, 0.10)
-        figure.line(ring, ACTIVE, 1.0)
+        panel.outline(outline_km, ACTIVE, 0.10)
     for shown, colour, diameter in (
         (~measures.matched, NOT_MATCHED, 2.6),
         (measures.matched & ~measures.active, DEACTIVATED, 3.2),
@@ -58,6 +54,21 @@ def ground_overview(report: RegistrationReport) -> Figure:
     ):
         figure.discs(panel.places(*points_km[shown].T), diameter, colour)
     return figure
+
+
+def kilometres(lon_lat: Array, centre: Array) -> Array:
+    """Kilometres (n, 2) east and north of a centre, of lon, lat (n, 2); across the antimeridian too."""
+    offset = lon_lat - centre
+    offset[:, 0] = wrapped_degrees(offset[:, 0])
+    return np.asarray(offset * np.array(metres_per_degree(float(centre[1]), 0.0)) / 1000.0)
+
+
+def ground_panel(height: float, shown: Array, unit: str = "km") -> Panel:
+    """A panel with a grid that shows places (n, 2) east and north, in a figure of its own."""
+    panel = equal_panel(Figure(height), shown)
+    panel.x_axis(f"{unit} east", count=8, grid=True)
+    panel.y_axis(f"{unit} north", grid=True)
+    return panel
 
 
 def equal_panel(figure: Figure, shown: Array) -> Panel:
@@ -75,7 +86,10 @@ def equal_panel(figure: Figure, shown: Array) -> Panel:
 
 
 def residual_map(report: RegistrationReport) -> Figure:
-    """Residual vectors of the active points on the image, enlarged, with an arrow for the scale."""
+    """Residual vectors of the active points on the image, enlarged, with an arrow for the scale.
+
+    Residual vectors on the image, enlarged; the arrow above gives the scale.
+    """
     panel = image_panel(report, darkness=0.45, above=20.0, below=2.0)
     figure, measures = panel.figure, report.figure_data.measures
     drawn = measures.active & np.isfinite(measures.residual_px).all(axis=1)
@@ -101,7 +115,10 @@ def residual_map(report: RegistrationReport) -> Figure:
 
 
 def coverage_map(report: RegistrationReport) -> Figure:
-    """The points on the image by status and reason, and the cells without an active point."""
+    """The points on the image by status and reason, and the cells without an active point.
+
+    Points on the image. Cells in orange hold no active point;
+    """
     groups = _groups(report)
     below = 8.0 + _LEGEND_ROW * ((len(groups) + 1) // 2)
     panel = image_panel(report, darkness=0.6, above=2.0, below=below)
@@ -167,7 +184,10 @@ def _draw_group(figure: Figure, places: Array, shape: str, colour: str, crowd: f
 
 
 def predicted_map(report: RegistrationReport) -> Figure:
-    """CE90 that the covariance of the correction predicts over the image."""
+    """CE90 that the covariance of the correction predicts over the image.
+
+    CE90 predicted by the covariance of the correction, pixels.
+    """
     lines, samples = (float(size) for size in report.scene.shape)
     left = left_margin((lines, 0.0))
     scale = min((WIDTH - left - 10.0) / samples, 540.0 / lines)

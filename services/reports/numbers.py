@@ -1,6 +1,7 @@
 """Numbers as text for people."""
 
 from amers.services.quality.accuracy import Quantile
+from amers.services.quality.block_requirements import BlockCriterion
 from amers.services.quality.criteria import Criterion
 
 ABSENT = "–"  # noqa: RUF001
@@ -17,6 +18,11 @@ def number(value: float, decimals: int = 2, unit: str = "") -> str:
 def metres(value_m: float) -> str:
     """A length; "unknown" for NaN."""
     return "unknown" if value_m != value_m else number(value_m, 2, "m")
+
+
+def degrees(angle_deg: float) -> str:
+    """An angle; a dash for NaN."""
+    return ABSENT if angle_deg != angle_deg else f"{angle_deg:.1f}°"
 
 
 def percent(ratio: float) -> str:
@@ -36,11 +42,11 @@ def quantile(estimate: Quantile) -> str:
     return f"{value} ({100 * estimate.confidence:.0f} % interval: {bounds})"
 
 
-def criterion_value(criterion: Criterion) -> str:
+def criterion_value(criterion: Criterion | BlockCriterion) -> str:
     """The value of a criterion with its unit."""
     return number(criterion.value, criterion.decimals, criterion.unit)
 
 
-def criterion_limit(criterion: Criterion) -> str:
+def criterion_limit(criterion: Criterion | BlockCriterion) -> str:
     """The limit of a criterion with its comparison and unit, such as "at most 1.00 px"."""
     return f"{criterion.comparison} {number(criterion.limit, criterion.decimals, criterion.unit)}"

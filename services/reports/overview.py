@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from amers.services.reports.html import page_template
+from amers.services.reports.html import Page, format_html
 
 
 @dataclass(frozen=True)
@@ -34,4 +34,6 @@ def format_overview(rows: Sequence[OverviewRow]) -> str:
     """The page, with links to the report of each scene."""
     counts = Counter(row.verdict for row in rows)
     words = ", ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
-    return page_template("overview.html").render(rows=rows, title=f"{len(rows)} scenes: {words}")
+    return format_html(
+        Page("overview.html", ()), {"rows": rows, "title": f"{len(rows)} scenes: {words}"}
+    )

@@ -1,6 +1,6 @@
 """Content of the report on a plan: the accuracy of a block before it exists."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
@@ -50,6 +50,33 @@ class PlanReport:
             before = one.on_the_earth.ce90_m
         return tuple(lines)
 
+    def document(self) -> dict[str, Any]:
+        """Members of the JSON document."""
+        found, names = self.forecast, [site.name for site in self.plan.candidates]
+        return {
+            "format": FORMAT,
+            "block": {"id": self.name},
+            "verdict": VERDICT,
+            "plan": self.plan,
+            "points": len(found.lon_lat),
+            "groups": found.groups,
+            "relative_to_control_points": found.relative,
+            "on_the_earth": found.on_the_earth,
+            "images": found.images,
+            "proposed": [
+                {
+                    "name": one.site.name,
+                    "lon_lat": one.site.lon_lat,
+                    "on_the_earth": one.on_the_earth,
+                    "gain_m": dict(zip(names, one.gain_m.tolist(), strict=True)),
+                }
+                for one in found.proposed
+            ],
+            "seconds": self.seconds,
+            "finished_at": self.finished_at,
+            "software_version": self.software_version,
+        }
+
 
 def accuracy_words(of: Accuracy90) -> str:
     """Both figures as text, mean and worst."""
@@ -57,42 +84,6 @@ def accuracy_words(of: Accuracy90) -> str:
         f"CE90 {of.ce90_m:.2f} m, LE90 {of.le90_m:.2f} m on average; "
         f"worst place {of.worst_ce90_m:.2f} m, {of.worst_le90_m:.2f} m"
     )
-
-
-def plan_document(report: PlanReport) -> dict[str, Any]:
-    """The report as JSON values, null where a figure is unknown."""
-    found = report.forecast
-    known = {
-        "format": FORMAT,
-        "block": {"id": report.name},
-        "verdict": VERDICT,
-        "plan": asdict(report.plan),
-        "points": len(found.lon_lat),
-        "groups": found.groups,
-        "relative_to_control_points": asdict(found.relative),
-        "on_the_earth": asdict(found.on_the_earth),
-        "images": [asdict(image) for image in found.images],
-        "proposed": [
-            {
-                "name": one.site.name,
-                "lon_lat": list(one.site.lon_lat),
-                "on_the_earth": asdict(one.on_the_earth),
-                "gain_m": dict(
-                    zip(
-                        (site.name for site in report.plan.candidates),
-                        one.gain_m.tolist(),
-                        strict=True,
-                    )
-                ),
-            }
-            for one in found.proposed
-        ],
-        "seconds": report.seconds,
-        "finished_at": report.finished_at.isoformat(),
-        "software_version": report.software_version,
-    }
-    document: dict[str, Any] = _without_nan(known)
-    return document
 
 
 def points_csv(report: PlanReport) -> str:
@@ -103,11 +94,3 @@ def points_csv(report: PlanReport) -> str:
     for (lon, lat), ce90_m, le90_m in rows:
         lines.append(f"{lon:.6f},{lat:.6f},{ce90_m:.3f},{le90_m:.3f}")
     return "\n".join(lines) + "\n"
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_nan(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(one) for one in value]
-    return None if value != value else value

@@ -1,13 +1,10 @@
-"""The report on a plan as tables for a terminal, as a page, and as maps."""
+"""The report on a plan as a page, and its maps."""
 
 import numpy as np
-from markupsafe import Markup
-from rich.table import Table
 
-from amers.services.geodesy import metres_per_degree, wrapped_degrees
-from amers.services.reports.html import page_template
-from amers.services.reports.maps import equal_panel
-from amers.services.reports.plan import PlanReport, accuracy_words
+from amers.services.reports.html import Page
+from amers.services.reports.maps import equal_panel, kilometres
+from amers.services.reports.plan import PlanReport
 from amers.services.reports.plot import INK, SMALL_TEXT, Figure, Panel
 from amers.services.types import Array
 
@@ -16,41 +13,11 @@ _PROPOSED, _SITE = "#b3372f", "#1b7837"
 _HEIGHT, _LEGEND = 300.0, 34.0
 
 
-def format_plan_html(report: PlanReport) -> str:
-    """The report as a self-contained page for screen, phone and paper."""
-    return page_template("plan.html").render(
-        report=report,
-        accuracy_words=accuracy_words,
-        accuracy_map=Markup(accuracy_map(report).markup("Predicted CE90 of the ground")),
-        gain_map=Markup(gain_map(report).markup("Where one more site helps"))
-        if report.forecast.proposed
-        else None,
-    )
-
-
-def plan_tables(report: PlanReport) -> list[Table]:
-    """The report as tables for a terminal."""
-    images = Table(
-        "image", "points", "CE90 rel. m", "LE90 rel. m", "CE90 Earth m", "LE90 Earth m", "worst m",
-        title="Predicted accuracy of the images", title_justify="left",
-    )  # fmt: skip
-    for one in report.forecast.images:
-        figures = (
-            one.relative.ce90_m,
-            one.relative.le90_m,
-            one.on_the_earth.ce90_m,
-            one.on_the_earth.le90_m,
-            one.on_the_earth.worst_ce90_m,
-        )
-        words = (f"{value:.2f}" if np.isfinite(value) else "unknown" for value in figures)
-        images.add_row(one.name, f"{one.points:,}", *words)
-    for column in images.columns[1:]:
-        column.justify = "right"
-    return [images]
-
-
 def accuracy_map(report: PlanReport) -> Figure:
-    """CE90 on the Earth over the ground, with the sites that are known and proposed."""
+    """CE90 on the Earth over the ground, with the sites that are known and proposed.
+
+    Predicted CE90 on the Earth. Triangles: known sites. Squares: proposed sites, in order.
+    """
     found = report.forecast
     figure, panel = _panel(report)
     km = _km(report, found.lon_lat)
@@ -68,7 +35,10 @@ def accuracy_map(report: PlanReport) -> Figure:
 
 
 def gain_map(report: PlanReport) -> Figure:
-    """By how much each candidate alone lowers the mean CE90 of the ground."""
+    """By how much each candidate alone lowers the mean CE90 of the ground.
+
+    One more site: the larger the disc, the more it lowers the mean CE90 on the Earth.
+    """
     figure, panel = _panel(report)
     gain_m = report.forecast.proposed[0].gain_m
     shown = np.flatnonzero(np.isfinite(gain_m))
@@ -101,17 +71,15 @@ def _panel(report: PlanReport) -> tuple[Figure, Panel]:
 def _sites(report: PlanReport, panel: Panel) -> None:
     known = np.array([site.lon_lat for site in report.plan.sites]).reshape(-1, 2)
     panel.figure.marks(panel.places(*_km(report, known).T), "^", 7.0, _SITE)
-    for number, one in enumerate(report.forecast.proposed):
+    for rank, one in enumerate(report.forecast.proposed):
         place = panel.places(*_km(report, np.array([one.site.lon_lat])).T)
         panel.figure.marks(place, "s", 7.0, _PROPOSED)
-        panel.figure.text(
-            float(place[0, 0]) + 5.0, float(place[0, 1]) + 3.0, str(number + 1), colour=INK
-        )
+        panel.figure.text(float(place[0, 0]) + 5.0, float(place[0, 1]) + 3.0, str(rank + 1), colour=INK)
 
 
 def _km(report: PlanReport, lon_lat: Array) -> Array:
     """Kilometres (n, 2) east and north of the first point of the ground."""
-    origin = report.forecast.lon_lat[0]
-    offset = lon_lat - origin
-    offset[:, 0] = wrapped_degrees(offset[:, 0])
-    return np.asarray(offset * np.array(metres_per_degree(float(origin[1]), 0.0)) / 1000.0)
+    return kilometres(lon_lat, report.forecast.lon_lat[0])
+
+
+PLAN_PAGE = Page("plan.html", (accuracy_map, gain_map))

@@ -182,6 +182,12 @@ class Panel:
         )
         self.figure.line(np.concatenate([corners, corners[:1]]), QUIET, 0.6)
 
+    def outline(self, ring: Array, colour: str, opacity: float) -> None:
+        """Draw a closed line through places (n, 2) of the data, and fill it."""
+        places = self.places(*np.concatenate([ring, ring[:1]]).T)
+        self.figure.area(places, colour, opacity)
+        self.figure.line(places, colour, 1.0)
+
     def x_axis(
         self, label: str = "", *, count: int = 4, numbers: bool = True, grid: bool = False
     ) -> None:

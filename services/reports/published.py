@@ -5,7 +5,10 @@ Source: Space Reference Points on Africa (2021): tables 2 and 4 (equipment, here
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+from markupsafe import Markup
 
 from amers.services.reports.report import RegistrationReport
 
@@ -34,6 +37,12 @@ class PublishedTable:
     values: tuple[float, ...]
     decimals: tuple[int, ...]
     note: str
+
+    def heads(self, shown: Sequence[int] | None = None) -> list[str]:
+        """Plain heads of all or of some columns, with those published below where they differ."""
+        pairs = [(self.words[k], self.columns[k]) for k in shown or range(len(self.columns))]
+        both = Markup("{}<small>{}</small>")
+        return [word if word == column else both.format(word, column) for word, column in pairs]
 
     @property
     def known(self) -> tuple[int, ...]:

@@ -1,6 +1,6 @@
 """Content of the report on a selection of images."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
@@ -90,6 +90,7 @@ class SelectionReport:
         seconds: that the selection took.
         finished_at: UTC.
         software_version: of Amers.
+        selection: that the maps draw; not part of the document.
     """
 
     source: SourceFacts
@@ -112,6 +113,7 @@ class SelectionReport:
     seconds: float
     finished_at: datetime
     software_version: str
+    selection: ImageSelection
 
     @property
     def share_short(self) -> float:
@@ -137,6 +139,22 @@ class SelectionReport:
             return f"All ground has {needed} clear views. {relaxed}."
         missing = f"{share_words(self.share_short)} of the ground has fewer than {needed} clear views"
         return f"{missing}: the catalogue has no more. {relaxed}."
+
+    def document(self) -> dict[str, Any]:
+        """Members of the JSON document."""
+        times = ("first", "middle", "last")
+        return {
+            "format": FORMAT,
+            "catalogue": self.source.name,
+            "verdict": self.verdict,
+            "verdict_words": self.verdict_words,
+            **{
+                name: value
+                for name, value in vars(self).items()
+                if name not in ("acquired", "selection")
+            },
+            "acquired": dict(zip(times, self.acquired, strict=False)),
+        }
 
 
 def selection_report(
@@ -197,24 +215,8 @@ def selection_report(
         seconds=seconds,
         finished_at=finished_at,
         software_version=software_version,
+        selection=selection,
     )
-
-
-def selection_document(report: SelectionReport) -> dict[str, Any]:
-    """The report as JSON values."""
-    values = asdict(report)
-    times = ("first", "middle", "last")
-    return {
-        "format": FORMAT,
-        "catalogue": report.source.name,
-        "verdict": report.verdict,
-        "verdict_words": report.verdict_words,
-        **{key: value for key, value in values.items() if key not in ("verdict", "acquired")},
-        "acquired": {
-            name: moment.isoformat() for name, moment in zip(times, report.acquired, strict=False)
-        },
-        "finished_at": report.finished_at.isoformat(),
-    }
 
 
 def overlap_csv(report: SelectionReport) -> str:

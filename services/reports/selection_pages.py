@@ -1,73 +1,24 @@
-"""The report on a selection of images as tables for a terminal, as a page, and as maps."""
+"""The report on a selection of images as a page, and its maps."""
 
 import numpy as np
 import numpy.typing as npt
-from markupsafe import Markup
-from rich.table import Table
 
-from amers.services.production.image_selection import CellViews, ImageSelection
-from amers.services.reports.html import page_template
-from amers.services.reports.plot import SMALL_TEXT, WIDTH, Figure, Panel
-from amers.services.reports.selection import (
-    COMPLETE,
-    RELAXED,
-    SelectionReport,
-    share_words,
-    views_words,
-)
+from amers.services.production.image_selection import CellViews
+from amers.services.reports.drawing import legend, rgb_values
+from amers.services.reports.html import Page
+from amers.services.reports.plot import WIDTH, Figure, Panel
+from amers.services.reports.selection import SelectionReport, share_words, views_words
 from amers.services.types import Array
 
-_TONES = {COMPLETE: "good", RELAXED: "usable"}
 _REACHED = "#7fb2e5"
 _RELAXED = ("#ffe08a", "#f5b041", "#d68910", "#935116")
 _SHORT = ("#f1948a", "#e74c3c", "#b3372f", "#7b241c")
 _FEW, _ENOUGH, _MANY = np.array([179, 55, 47]), np.array([214, 232, 250]), np.array([0, 72, 160])
 _TALLEST = 420.0
 _PIXELS_ACROSS = 1000
-_LEGEND_HEIGHT = 52.0
+_LEGEND_HEIGHT, _LEGEND_TOP = 52.0, 44.0
 
 Colours = npt.NDArray[np.uint8]
-
-
-def format_selection_html(report: SelectionReport, selection: ImageSelection) -> str:
-    """The report as a self-contained page for screen, phone and paper."""
-    return page_template("selection.html").render(
-        report=report,
-        tone=_TONES.get(report.verdict, "failed"),
-        state_map=Markup(state_map(selection).markup("Ground with enough views, relaxed and short")),
-        views_map=Markup(views_map(selection).markup("Clear views of the ground")),
-        share=share_words,
-        views_words=views_words,
-        use=use_rows(report),
-    )
-
-
-def selection_tables(report: SelectionReport) -> list[Table]:
-    """The report as tables for a terminal."""
-    use = Table("images", "number", title="Images of the catalogue", title_justify="left")
-    for words, number in use_rows(report):
-        use.add_row(words, f"{number:,}")
-    limits = Table(
-        "cloud below",
-        "chosen images",
-        "km2 with this limit",
-        "share",
-        title="Cloud limits",
-        title_justify="left",
-    )
-    for row in report.limits:
-        cells = f"{row.images:,}", f"{row.area_km2:,.0f}", share_words(row.share)
-        limits.add_row(f"{row.below_percent:g} %", *cells)
-    overlap = Table(
-        "clear views", "km2", "share", "share by all usable", title="Overlap", title_justify="left"
-    )
-    for views in report.overlap:
-        shares = share_words(views.share), share_words(views.share_available)
-        overlap.add_row(views_words(views, report), f"{views.area_km2:,.0f}", *shares)
-    for table in (use, limits, overlap):
-        for column in table.columns[1:]:
-            column.justify = "right"
-    return [use, limits, overlap]
 
 
 def use_rows(report: SelectionReport) -> list[tuple[str, int]]:
@@ -86,8 +37,14 @@ def use_rows(report: SelectionReport) -> list[tuple[str, int]]:
     return [*shown, ("usable", use.usable), ("chosen", use.selected)]
 
 
-def state_map(selection: ImageSelection) -> Figure:
-    """The ground: enough views below the first cloud limit, with relaxed limits, or too few."""
+def state_map(report: SelectionReport) -> Figure:
+    """The ground: enough views below the first cloud limit, with relaxed limits, or too few.
+
+    Blue: enough clear views by images below the first cloud limit. Yellow to brown: the catalogue
+    has too few of these, and cloudier images count outside of their masks. Red: short of views with
+    all usable images.
+    """
+    selection = report.selection
     cells, options = selection.cells, selection.options
     missing = selection.missing
     steps = len(options.cloud_limits_percent)
@@ -102,15 +59,18 @@ def state_map(selection: ImageSelection) -> Figure:
         names.append(f"{count} missing")
         place = (count - 1) * len(_SHORT) // options.min_views
         colours.append(_SHORT[place])
-    rgb = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in colours], dtype=np.uint8)
     present = [k for k in range(len(names)) if (kind == k).any()]
-    figure = _cell_map(cells, rgb[kind])
-    _legend(figure, [(names[k], colours[k]) for k in present])
+    figure = _cell_map(cells, rgb_values(colours)[kind])
+    legend(figure, figure.height - _LEGEND_TOP, [(names[k], colours[k]) for k in present])
     return figure
 
 
-def views_map(selection: ImageSelection) -> Figure:
-    """Clear views of the ground by the chosen images."""
+def views_map(report: SelectionReport) -> Figure:
+    """Clear views of the ground by the chosen images.
+
+    Clear views by the chosen images that count in each cell.
+    """
+    selection = report.selection
     needed = selection.options.min_views
     views = np.arange(2 * needed + 1)
     below = (views / needed)[:, None]
@@ -122,7 +82,8 @@ def views_map(selection: ImageSelection) -> Figure:
     figure = _cell_map(selection.cells, rgb[np.minimum(selection.cells.views, 2 * needed)])
     shown = sorted({0, needed // 2, needed - 1, needed, needed + needed // 2, 2 * needed})
     names = {2 * needed: f"{2 * needed} or more"}
-    _legend(figure, [(names.get(k, str(k)), "#{:02x}{:02x}{:02x}".format(*rgb[k])) for k in shown])
+    entries = [(names.get(k, str(k)), "#{:02x}{:02x}{:02x}".format(*rgb[k])) for k in shown]
+    legend(figure, figure.height - _LEGEND_TOP, entries)
     return figure
 
 
@@ -165,11 +126,4 @@ def _longitudes(west: Array, east: Array) -> tuple[float, float]:
     return first, first + float(((east - first - 1e-9) % 360.0).max())
 
 
-def _legend(figure: Figure, entries: list[tuple[str, str]]) -> None:
-    """Write names with boxes of their colours below a map."""
-    columns = 3
-    for k, (name, colour) in enumerate(entries):
-        x = 52.0 + (k % columns) * (WIDTH - 60.0) / columns
-        y = figure.height - _LEGEND_HEIGHT + 12.0 * (k // columns) + 8.0
-        figure.box((x, y - 7.0), (9.0, 8.0), colour)
-        figure.text(x + 13.0, y, name, size=SMALL_TEXT)
+SELECTION_PAGE = Page("selection.html", (state_map, views_map, share_words, use_rows, views_words))

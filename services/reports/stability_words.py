@@ -1,15 +1,8 @@
 """What hold-outs show, in words: the same in every report."""
 
 from amers.services.quality.cell_stability import CellStability
-from amers.services.quality.stability import GroupMeans
-from amers.services.reports.numbers import number
-
-CELLS_EXPLANATION = (
-    "When points are held out at random, their neighbours remain, and a common error of neighbours "
-    "stays hidden. It appears when a whole cell is held out. A factor above about 1.5 means that points "
-    "have common errors, so that more points add less accuracy than their number suggests. An error of "
-    "all points, or over the whole image, appears in neither table. No verdict depends on this."
-)
+from amers.services.quality.stability import GroupMeans, Stability
+from amers.services.reports.numbers import number, percent
 
 
 def cells_left_out_text(stability: CellStability) -> str:
@@ -29,4 +22,16 @@ def group_means_text(means: GroupMeans) -> str:
         f"Mean residuals of the points held out together: rms {number(means.rms_px)} px, "
         f"{number(means.over_independent, 1)} times what independent errors give and "
         f"{number(means.over_stated, 1)} times what the stated accuracy gives."
+    )
+
+
+def held_out_text(stability: Stability) -> str:
+    """How adjustments with fewer points were drawn, and what they show, as sentences."""
+    held_px, held_m = stability.held_out_px.xy, stability.held_out_m.xy
+    return (
+        f"{stability.draws} adjustments with {percent(stability.kept_share)} of the active points. "
+        f"Residuals of the {stability.held_out_per_draw} points held out each time: mean "
+        f"{number(held_px.mean)} px ({number(held_m.mean)} m), std {number(held_px.std)} px "
+        f"({number(held_m.std)} m), n = {held_px.n}. {group_means_text(stability.group_means)} Shows "
+        "stability, not absolute accuracy."
     )

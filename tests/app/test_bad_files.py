@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from amers.app.usecases.registration.failure import FAILURE_OUTPUTS
+from amers.app.usecases.report_files import REPORT_FILES
 from tests.app.bad_images import ARCHIVES, IMAGES, MODELS, BadScene, folder_archive
 from tests.app.bad_requests import BAD_REQUESTS
 from tests.app.conftest import TEMPLATE, fresh_database
@@ -105,7 +105,7 @@ def test_a_bad_scene_is_refused_or_its_job_fails_with_the_reason(
     if reply.status_code == 201:
         job = store.outcome(reply)
         failed(store, job, case.says)
-        added = {f"results/{job['jobID']}/1/{name}" for name in FAILURE_OUTPUTS}
+        added = {f"results/{job['jobID']}/1/{name}" for name in REPORT_FILES}
     else:
         refused(store, reply, case.says)
         added = set()

@@ -13,8 +13,8 @@ from jsonschema import validate
 from amers.app.config import Settings
 from amers.app.db import engine
 from amers.app.storage import Storage
-from amers.app.usecases.registration.failure import FAILURE_OUTPUTS
 from amers.app.usecases.registration.result_folder import MANIFEST
+from amers.app.usecases.report_files import REPORT_FILES
 from amers.services.formats.sensor_models.rpc_files import read_rpc
 from amers.services.reports.document import failure_schema, report_schema
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
@@ -399,7 +399,7 @@ def test_a_registration_that_fails_leaves_its_own_report_and_no_older_one(
     assert good.returncode == 0, good.stderr
     failed = amers(*scene, "--sigma-m", 0.1)
     assert failed.returncode == 3, failed.stderr
-    assert {path.name for path in folder.iterdir()} == {*FAILURE_OUTPUTS, MANIFEST}
+    assert {path.name for path in folder.iterdir()} == {*REPORT_FILES, MANIFEST}
     report = json.loads((folder / "report.json").read_text())
     validate(report, failure_schema())
     assert (report["verdict"], report["error"], report["visible"]) == (

@@ -11,6 +11,7 @@ from pathlib import Path
 from amers.app.errors import InputError
 from amers.app.usecases.registration.reference_source import ReferenceFiles, read_reference
 from amers.app.usecases.registration.result_folder import replacing
+from amers.app.usecases.report_files import write_report
 from amers.app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
 from amers.services.formats.block.check import check_block
 from amers.services.formats.block.document import BlockMetadata
@@ -33,8 +34,7 @@ from amers.services.reports.block_quality import (
     MeasuredErrors,
     block_quality_report,
 )
-from amers.services.reports.block_quality_pages import format_block_quality_html
-from amers.services.reports.document import format_report
+from amers.services.reports.block_quality_pages import QUALITY_PAGE
 from amers.services.types import ChipSource, ControlPoints, Progress, no_progress, part_of
 
 LEAST_INCLINED = 10
@@ -222,11 +222,8 @@ def write_quality(report: BlockQualityReport, folder: Path) -> None:
 
 
 def write_quality_files(report: BlockQualityReport, folder: Path) -> dict[str, Path]:
-    """Write the document and the page of a report into an existing folder; returns the files by name."""
-    files = {DOCUMENT: format_report(report), PAGE: format_block_quality_html(report)}
-    for name, content in files.items():
-        (folder / name).write_text(content, encoding="utf-8")
-    return {name: folder / name for name in files}
+    """Write the document and the page of a report into a folder; returns the files by name."""
+    return write_report(folder, QUALITY_PAGE, report, "block_quality")
 
 
 def _measure_heights(points: ControlPoints, files: HeightFiles) -> tuple[HeightQuality, HeightErrors]:

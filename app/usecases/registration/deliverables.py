@@ -4,16 +4,15 @@ from pathlib import Path
 
 import numpy as np
 
+from amers.app.usecases.report_files import write_report, write_texts
 from amers.services.formats.gcp.json_formats import format_measures, format_opf
 from amers.services.formats.gcp.marked_points import marked_points
 from amers.services.formats.gcp.odm import format_gcp_list
 from amers.services.formats.gcp.pci import format_pci_text
 from amers.services.formats.gcp.text_formats import format_asp_gcp, format_envi_pts, format_qgis_points
 from amers.services.formats.vector.residual_layers import exaggeration_for, write_residual_layers
-from amers.services.reports.document import format_report
-from amers.services.reports.html import format_html
+from amers.services.reports.registration_pages import REGISTRATION_PAGE
 from amers.services.reports.report import RegistrationReport
-from amers.services.reports.tables import format_tables
 from amers.services.types import Array, ControlPoints, Measures
 
 OUTPUTS = {
@@ -39,29 +38,23 @@ TITLES = {**OUTPUTS, "attitude.csv": "Roll and pitch over time of a rigorous mod
 
 def write_outputs(
     folder: Path, report: RegistrationReport, image: str, points: ControlPoints
-) -> list[Path]:
-    """Write the report of a registration and its control points into a folder; returns the paths.
+) -> dict[str, Path]:
+    """Write the report and the control points of a registration; returns the files by name.
 
     Args:
-        folder: must exist; files of the same names are replaced.
+        folder: created when missing; files of the same names are replaced.
         report: of the registration.
         image: file name of the scene, which the control points refer to.
         points: the control points of the registration, for their precision.
     """
     measures = report.figure_data.measures
     sigma_m = _point_sigmas_m(points, measures)
-    texts = {
-        "report.json": format_report(report),
-        "report.html": format_html(report),
-        "report.txt": format_tables(report),
-        "control_points.geojson": format_measures(measures, image, sigma_m),
-        **_exchange_formats(measures, image, sigma_m),
-    }
-    for name, text in texts.items():
-        (folder / name).write_text(text, encoding="utf-8")
+    files = write_report(folder, REGISTRATION_PAGE, report)
+    geojson = format_measures(measures, image, sigma_m)
+    texts = {"control_points.geojson": geojson, **_exchange_formats(measures, image, sigma_m)}
     layers = folder / "residuals.gpkg"
     write_residual_layers(layers, measures, image, exaggeration_for(measures))
-    return [*(folder / name for name in texts), layers]
+    return {**files, **write_texts(folder, texts), layers.name: layers}
 
 
 def _exchange_formats(measures: Measures, image: str, sigma_m: Array) -> dict[str, str]:

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from amers.app.usecases.registration.control_sources import ControlSet
+from amers.app.usecases.report_files import write_report
 from amers.services.errors import AmersError, CoverageError
 from amers.services.imagery.scene import Scene
 from amers.services.registration.context import SearchStage
 from amers.services.registration.options import RegistrationOptions
 from amers.services.registration.point_selection import visible_points
 from amers.services.reports.build import scene_record
-from amers.services.reports.document import format_report
 from amers.services.reports.failure import (
     EXPLANATION,
     FAILURE_FORMAT,
@@ -24,11 +24,9 @@ from amers.services.reports.failure import (
     UnreadScene,
     next_steps,
 )
-from amers.services.reports.failure_pages import format_failure_html, format_failure_tables
+from amers.services.reports.failure_pages import FAILURE_PAGE
 from amers.services.reports.report import BlockUsed, RunRecord
 from amers.services.types import Array
-
-FAILURE_OUTPUTS = ("report.json", "report.html", "report.txt")
 
 
 @dataclass
@@ -55,14 +53,22 @@ class Attempt:
     reference: str = ""
     stages: list[SearchStage] = field(default_factory=list)
 
+    def run_record(self) -> RunRecord:
+        """How and when the registration was run; it ends now."""
+        blocks = () if self.control is None else self.control.blocks
+        return RunRecord(
+            software_version=version("amers"),
+            started_at=self.started_at,
+            finished_at=datetime.now(UTC),
+            method="reference image" if self.reference else "control points",
+            blocks=(BlockUsed(self.reference, "reference image"),) if self.reference else blocks,
+            options=self.options,
+        )
+
 
 def write_failure(folder: Path, attempt: Attempt, error: AmersError) -> None:
     """Write the report of an attempt that an error has ended into a folder, created when missing."""
-    report = _failure_report(attempt, error)
-    folder.mkdir(parents=True, exist_ok=True)
-    texts = format_report(report), format_failure_html(report), format_failure_tables(report)
-    for name, text in zip(FAILURE_OUTPUTS, texts, strict=True):
-        (folder / name).write_text(text, encoding="utf-8")
+    write_report(folder, FAILURE_PAGE, _failure_report(attempt, error))
 
 
 def _failure_report(attempt: Attempt, error: AmersError) -> FailureReport:
@@ -71,14 +77,7 @@ def _failure_report(attempt: Attempt, error: AmersError) -> FailureReport:
     stages = tuple(attempt.stages)
     return FailureReport(
         format=FAILURE_FORMAT,
-        run=RunRecord(
-            software_version=version("amers"),
-            started_at=attempt.started_at,
-            finished_at=datetime.now(UTC),
-            method="reference image" if attempt.reference else "control points",
-            blocks=_blocks(attempt),
-            options=attempt.options,
-        ),
+        run=attempt.run_record(),
         verdict=NOT_REGISTERED,
         verdict_explanation=EXPLANATION,
         relative_to_control_points=NO_ACCURACY.relative_to_control_points,
@@ -92,13 +91,6 @@ def _failure_report(attempt: Attempt, error: AmersError) -> FailureReport:
         next_steps=next_steps(error, record, stages, attempt.command),
         ground=_ground(attempt),
     )
-
-
-def _blocks(attempt: Attempt) -> tuple[BlockUsed, ...]:
-    """The blocks whose points were tried, or the reference image."""
-    if attempt.reference:
-        return (BlockUsed(attempt.reference, "reference image"),)
-    return () if attempt.control is None else attempt.control.blocks
 
 
 def _visible(attempt: Attempt) -> int | None:

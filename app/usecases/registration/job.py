@@ -1,5 +1,6 @@
 """The process `register-scene`: register an uploaded scene on points and references of the store."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
@@ -10,6 +11,7 @@ from uuid import UUID
 from amers.app.auth import Scope
 from amers.app.db import scenes
 from amers.app.db.engine import Connection
+from amers.app.db.scenes import SceneRow
 from amers.app.db.tokens import Token
 from amers.app.errors import AmersError, ComputationError, InputError, TooLarge, is_no_memory
 from amers.app.usecases.damage import suspecting_damage
@@ -17,19 +19,19 @@ from amers.app.usecases.processes import Commit, Process, Work, WorkFailed
 from amers.app.usecases.references import references_of_store
 from amers.app.usecases.registration.control_sources import points_of_store
 from amers.app.usecases.registration.deliverables import OUTPUTS
-from amers.app.usecases.registration.failure import FAILURE_OUTPUTS
 from amers.app.usecases.registration.register import (
     ControlSources,
+    RegisteredScene,
     SceneFiles,
     record_registration,
     run_registration,
 )
+from amers.app.usecases.report_files import REPORT_FILES
 from amers.app.usecases.results import store_results
 from amers.app.usecases.scene_inputs import check_file_names, check_scene, naming, present_scene
 from amers.app.usecases.scenes import local_image, stored_keys
 from amers.services.formats.gcp.marked_points import check_heights
 from amers.services.formats.images.bands import parse_bands
-from amers.services.imagery.scene import scene_gsd_m
 from amers.services.quality.accuracy_statement import accuracy_document
 from amers.services.registration.options import RegistrationOptions
 from amers.services.reports.failure import NO_ACCURACY, NOT_REGISTERED
@@ -101,18 +103,12 @@ def _run(work: Work) -> Commit:
         except (InputError, ComputationError) as error:
             if is_no_memory(error):
                 raise
-            raise _with_report(work, Path(folder), error) from error
-        gsd_m = scene_gsd_m(registered.scene)
+            paths = {name: Path(folder, name) for name in REPORT_FILES}
+            raise with_reports(work, paths, error, accuracy_document(NO_ACCURACY)) from error
         keys = store_results(work, registered.files)
 
     def commit(connection: Connection) -> dict[str, Any]:
-        scene_key = scene.sha256 or f"scene {scene.id}"
-        record_registration(
-            connection, registered, scene_key, job_id=work.job.id, scene_id=scene.id, keys=keys
-        )
-        scenes.set_footprint(connection, scene.id, registered.footprint)
-        acquisition, shape = registered.scene.acquisition, registered.scene.image.shape
-        scenes.describe(connection, scene.id, acquisition, shape, gsd_m)
+        commit_scene(connection, work, scene, registered, keys)
         return {
             "verdict": registered.report.verdict,
             "verdict_scope": registered.report.verdict_scope,
@@ -124,15 +120,48 @@ def _run(work: Work) -> Commit:
     return commit
 
 
-def _with_report(work: Work, folder: Path, error: AmersError) -> WorkFailed | AmersError:
-    """The error of a registration with the report of its failure; without it where there is no room."""
+def commit_scene(
+    connection: Connection,
+    work: Work,
+    scene: SceneRow,
+    registered: RegisteredScene,
+    keys: dict[str, str],
+) -> None:
+    """Store the registration of an uploaded scene, and what its files contain about it.
+
+    Args:
+        connection: with the transaction that ends the job.
+        work: the job.
+        scene: that was registered.
+        registered: its registration.
+        keys: storage keys of its outputs, by name.
+    """
+    scene_key, record = scene.sha256 or f"scene {scene.id}", registered.report.scene
+    record_registration(
+        connection, registered, scene_key, job_id=work.job.id, scene_id=scene.id, keys=keys
+    )
+    scenes.set_footprint(connection, scene.id, registered.footprint)
+    scenes.describe(connection, scene.id, record.acquisition, record.shape, record.gsd_m)
+
+
+def with_reports(
+    work: Work, files: Mapping[str, Path], error: AmersError, values: Mapping[str, Any]
+) -> WorkFailed | AmersError:
+    """The error of a job with the reports of the failure; without them where there are none or no room.
+
+    Args:
+        work: the job.
+        files: reports, by name.
+        error: that ended it.
+        values: further results.
+    """
+    if not files:
+        return error
     try:
-        keys = store_results(work, {name: folder / name for name in FAILURE_OUTPUTS})
+        keys = store_results(work, files)
     except TooLarge:
         return error
-    return WorkFailed(
-        error, {"verdict": NOT_REGISTERED, **accuracy_document(NO_ACCURACY), "files": keys}
-    )
+    return WorkFailed(error, {"verdict": NOT_REGISTERED, **values, "files": keys})
 
 
 def _control_sources(work: Work, method: Method) -> ControlSources:

@@ -1,5 +1,6 @@
 """The process `register-scenes`: register uploaded scenes together on the points of the store."""
 
+from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,18 +9,18 @@ from typing import Any
 from uuid import UUID
 
 from amers.app.auth import Scope
-from amers.app.db import scenes
 from amers.app.db.engine import Connection
 from amers.app.db.scenes import SceneRow
 from amers.app.db.tokens import Token
-from amers.app.errors import AmersError, ComputationError, InputError, TooLarge, is_no_memory
+from amers.app.errors import ComputationError, InputError, is_no_memory
 from amers.app.usecases.control_files import IMAGES_NPZ
 from amers.app.usecases.damage import suspecting_damage
-from amers.app.usecases.processes import Commit, Process, Work, WorkFailed
+from amers.app.usecases.processes import Commit, Process, Work
 from amers.app.usecases.registration.control_sources import points_of_store
+from amers.app.usecases.registration.job import commit_scene, with_reports
 from amers.app.usecases.registration.joined_job import fetch_joined, joinable_scenes
 from amers.app.usecases.registration.joined_scenes import SCENES_JSON
-from amers.app.usecases.registration.register import SceneFiles, record_registration
+from amers.app.usecases.registration.register import SceneFiles
 from amers.app.usecases.registration.together import (
     JointOutcome,
     JointPlace,
@@ -29,7 +30,6 @@ from amers.app.usecases.results import store_results
 from amers.app.usecases.scene_inputs import check_scene, present_scene
 from amers.app.usecases.scenes import local_image, stored_keys
 from amers.services.formats.images.bands import parse_bands
-from amers.services.imagery.scene import scene_gsd_m
 from amers.services.quality.accuracy_statement import accuracy_document
 from amers.services.registration.options import RegistrationOptions
 from amers.services.reports.failure import NO_ACCURACY, NOT_REGISTERED
@@ -108,25 +108,14 @@ def _run(work: Work) -> Commit:
         except (InputError, ComputationError) as error:
             if is_no_memory(error):
                 raise
-            raise _with_reports(work, folder, error) from error
-        keys = store_results(work, {**outcome.files, **_of_scenes(folder, list(rows))})
-        gsds_m = {name: scene_gsd_m(one.scene) for name, one in outcome.registered.items()}
+            paths = _of_scenes(folder, rows)
+            raise with_reports(work, paths, error, {}) from error
+        keys = store_results(work, {**outcome.files, **_of_scenes(folder, rows)})
 
     def commit(connection: Connection) -> dict[str, Any]:
         for name, registered in outcome.registered.items():
-            row = rows[name]
-            scene_key = row.sha256 or f"scene {row.id}"
-            record_registration(
-                connection,
-                registered,
-                scene_key,
-                job_id=work.job.id,
-                scene_id=row.id,
-                keys={output: keys[f"{name}/{output}"] for output in registered.files},
-            )
-            scenes.set_footprint(connection, row.id, registered.footprint)
-            acquisition, shape = registered.scene.acquisition, registered.scene.image.shape
-            scenes.describe(connection, row.id, acquisition, shape, gsds_m[name])
+            of_scene = {output: keys[f"{name}/{output}"] for output in registered.files}
+            commit_scene(connection, work, rows[name], registered, of_scene)
         return {
             "verdict": NOT_REGISTERED if outcome.failed else outcome.report.verdict,
             "verdict_words": outcome.report.verdict_words,
@@ -146,37 +135,20 @@ def _local_files(work: Work, row: SceneRow, stack: ExitStack) -> SceneFiles:
     return SceneFiles(image, sigma_m=row.sigma_m, bands=inputs.bands, rigorous=inputs.rigorous)
 
 
-def _of_scenes(folder: Path, names: list[str]) -> dict[str, Path]:
+def _of_scenes(folder: Path, names: Iterable[str]) -> dict[str, Path]:
     """The outputs of every scene, by the name of the scene and their own."""
-    return {f"{name}/{path.name}": path for name in names for path in sorted((folder / name).iterdir())}
+    return {f"{name}/{path.name}": path for name in names for path in sorted((folder / name).glob("*"))}
 
 
 def _scene_values(name: str, outcome: JointOutcome) -> dict[str, Any]:
     """What the results state of one scene."""
-    if name not in outcome.registered:
-        reason = str(outcome.failed[name])
-        return {
-            "scene": name,
-            "verdict": NOT_REGISTERED,
-            **accuracy_document(NO_ACCURACY),
-            "reason": reason,
-        }
-    quality = outcome.registered[name].registration.qualification
-    return {
-        "scene": name,
-        "verdict": quality.verdict,
-        **accuracy_document(quality.accuracy),
-        "reason": outcome.registered[name].report.verdict_explanation,
-    }
-
-
-def _with_reports(work: Work, folder: Path, error: AmersError) -> WorkFailed | AmersError:
-    """The error of a registration with the reports of its failure; without where there is no room."""
-    try:
-        keys = store_results(work, _of_scenes(folder, [str(scene) for scene in work.inputs.scenes]))
-    except (TooLarge, FileNotFoundError):
-        return error
-    return WorkFailed(error, {"verdict": NOT_REGISTERED, "files": keys})
+    one = outcome.registered.get(name)
+    if one is None:
+        stated = {"verdict": NOT_REGISTERED, **accuracy_document(NO_ACCURACY)}
+        return {"scene": name, **stated, "reason": str(outcome.failed[name])}
+    quality = one.registration.qualification
+    stated = {"verdict": quality.verdict, **accuracy_document(quality.accuracy)}
+    return {"scene": name, **stated, "reason": one.report.verdict_explanation}
 
 
 REGISTER_SCENES = Process(

@@ -1,9 +1,7 @@
 """Register a scene: read its files, find control, call the science, write the outcome."""
 
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from hashlib import sha256
-from importlib.metadata import version
 from pathlib import Path
 from uuid import UUID
 
@@ -15,7 +13,7 @@ from amers.app.db.engine import Connection
 from amers.app.usecases import history
 from amers.app.usecases.references import record_places
 from amers.app.usecases.registration.check_points import read_check_points
-from amers.app.usecases.registration.control_sources import ControlSet, FindPoints
+from amers.app.usecases.registration.control_sources import FindPoints
 from amers.app.usecases.registration.deliverables import write_outputs
 from amers.app.usecases.registration.failure import Attempt, write_failure
 from amers.app.usecases.registration.reference_source import (
@@ -27,16 +25,19 @@ from amers.services.conventions import MAX_ERROR_SIGMAS
 from amers.services.errors import ComputationError, CoverageError, InputError
 from amers.services.formats.images.bands import parse_bands
 from amers.services.formats.images.scenes import read_scene
-from amers.services.formats.sensor_models.refined_model import write_refined
+from amers.services.formats.sensor_models.refined_model import AdjustedRigorous, write_refined
 from amers.services.geodesy import metres_per_degree
 from amers.services.imagery.scene import Scene, scene_footprint
+from amers.services.joint.results import RigorousScene
 from amers.services.quality.check_points import CheckPoints, check_model, with_check_points
 from amers.services.registration.on_points import Registration, register_scene
 from amers.services.registration.options import RegistrationOptions
 from amers.services.reports.build import build_report, scene_record
 from amers.services.reports.document import report_document
 from amers.services.reports.figure_data import figure_data
-from amers.services.reports.report import Check, RefinedModelRecord, RegistrationReport, RunRecord
+from amers.services.reports.report import Check, RefinedModelRecord, RegistrationReport
+from amers.services.sensors.base import SensorModel
+from amers.services.sensors.parameter_sets import parameter_set_named
 from amers.services.types import Array, Progress, no_progress, part_of
 
 
@@ -65,6 +66,17 @@ class SceneFiles:
     check_heights: str | None = None
     rigorous: str | None = None
 
+    def read(self) -> Scene:
+        """The scene; its files stay open."""
+        return read_scene(
+            self.image,
+            self.model,
+            sigma_m=self.sigma_m,
+            bands=None if self.bands is None else parse_bands(self.bands),
+            mask=self.mask,
+            parameter_set=None if self.rigorous is None else parameter_set_named(self.rigorous),
+        )
+
 
 @dataclass(frozen=True)
 class ControlSources:
@@ -81,23 +93,24 @@ class ControlSources:
 
 @dataclass(frozen=True)
 class RegisteredScene:
-    """A registered scene and its outputs.
+    """The registration of a scene and its outputs.
 
     Attributes:
-        scene: as read; its pixels cannot be read once its files are deleted.
         registration: of the scene.
         reference: that the scene was registered on; None for control points.
         report: of the registration.
-        footprint: (n, 2) lon, lat outline of the scene.
         files: the outputs, by name.
     """
 
-    scene: Scene
     registration: Registration
     reference: CoveringReference | None
     report: RegistrationReport
-    footprint: Array
     files: dict[str, Path]
+
+    @property
+    def footprint(self) -> Array:
+        """Outline (n, 2) of the scene by the delivered model, lon and lat."""
+        return self.report.scene.footprint_lon_lat
 
 
 def run_registration(
@@ -144,26 +157,64 @@ def _register_and_write(
     progress: Progress,
 ) -> RegisteredScene:
     """Register one scene and write the outputs; what is done is noted in the attempt."""
-    options = attempt.options
-    bands = None if files.bands is None else parse_bands(files.bands)
-    scene = read_scene(files.image, files.model, sigma_m=files.sigma_m, bands=bands, mask=files.mask)
-    attempt.scene = scene
+    scene = attempt.scene = files.read()
     check_points = None
     if files.check_points is not None:
         check_points = read_check_points(files.check_points, files.check_heights, files.image, scene)
 
-    registration, control, reference = _register(scene, sources, attempt, part_of(progress, 0.0, 0.9))
+    registration, reference = _register(scene, sources, attempt, part_of(progress, 0.0, 0.9))
 
     checks: tuple[Check, ...] = ()
     if check_points is not None and files.check_points is not None:
-        registration, check = _check(registration, check_points, options, files.check_points.name)
+        registration, check = _check(
+            registration, check_points, attempt.options, files.check_points.name
+        )
         checks = (check,)
 
     progress(0.9, "writing the report")
+    registered = write_registered(
+        files, registration, attempt, folder, copy_image=copy_image, checks=checks
+    )
+    return replace(registered, reference=reference)
+
+
+def write_registered(
+    files: SceneFiles,
+    registration: Registration,
+    attempt: Attempt,
+    folder: Path,
+    *,
+    copy_image: bool,
+    checks: tuple[Check, ...] = (),
+    rigorous: RigorousScene | None = None,
+) -> RegisteredScene:
+    """Write the outputs of a scene that was registered alone or together with others.
+
+    Args:
+        files: of the scene.
+        registration: of the scene.
+        attempt: with the scene, as read, and its control.
+        folder: for the outputs; created when missing.
+        copy_image: also copy a GeoTIFF, with the refined model in its tags.
+        checks: accuracy at points that had no part in the registration.
+        rigorous: the adjusted rigorous model that is written in place of the corrected one.
+    """
+    scene, control = attempt.scene, attempt.control
+    assert scene is not None
+    assert control is not None
+    model: SensorModel | AdjustedRigorous = registration.model
+    if rigorous is not None:
+        model = AdjustedRigorous(
+            registration.model,
+            rigorous.heights_m,
+            rigorous.correction_error_px,
+            rigorous.attitude,
+        )
+    folder.mkdir(parents=True, exist_ok=True)
     refined = write_refined(
         files.image,
         files.model,
-        registration.model,
+        model,
         registration.adjustment,
         shape=scene.image.shape,
         folder=folder,
@@ -173,21 +224,15 @@ def _register_and_write(
     report = build_report(
         registration,
         scene_record(scene, files.image.stem),
-        RunRecord(
-            software_version=version("amers"),
-            started_at=attempt.started_at,
-            finished_at=datetime.now(UTC),
-            method="control points" if reference is None else "reference image",
-            blocks=control.blocks,
-            options=options,
-        ),
+        attempt.run_record(),
         RefinedModelRecord(refined.max_error_px, refined.note),
         figure_data(scene, control.points, control.chips, registration),
         checks=checks,
+        nearest_px=None if rigorous is None else rigorous.correction_error_px,
     )
-    paths = write_outputs(folder, report, files.image.name, control.points)
-    outputs = {path.name: path for path in (*paths, *refined.files)}
-    return RegisteredScene(scene, registration, reference, report, scene_footprint(scene), outputs)
+    outputs = write_outputs(folder, report, files.image.name, control.points)
+    outputs.update({path.name: path for path in refined.files})
+    return RegisteredScene(registration, None, report, outputs)
 
 
 def record_registration(
@@ -236,8 +281,8 @@ def image_key(image: Path) -> str:
 
 def _register(
     scene: Scene, sources: ControlSources, attempt: Attempt, progress: Progress
-) -> tuple[Registration, ControlSet, CoveringReference | None]:
-    """The registration of a scene on control points, or else on a reference image; and its control."""
+) -> tuple[Registration, CoveringReference | None]:
+    """The registration of a scene on control points, or else on a reference image, which is returned."""
     outline = grown(scene_footprint(scene), MAX_ERROR_SIGMAS * scene.sigma_m)
     no_control = CoverageError("no reference image shows the ground of the scene")
     if sources.find_points is not None:
@@ -252,14 +297,17 @@ def _register(
                 progress=progress,
                 stages=attempt.stages,
             )
-            return registration, control, None
+            return registration, None
         except CoverageError as error:
             no_control = error
     reference = None if sources.find_reference is None else sources.find_reference(outline)
     if reference is None:
         raise no_control
     attempt.reference = reference.name
-    return (*register_on(reference, scene, attempt.options, progress, attempt.stages), reference)
+    registration, attempt.control = register_on(
+        reference, scene, attempt.options, progress, attempt.stages
+    )
+    return registration, reference
 
 
 def _check(

@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +11,7 @@ import shapely
 
 from amers.app.usecases.control_files import IMAGES_NPZ
 from amers.app.usecases.executors import ComputeOptions, open_executor
-from amers.app.usecases.registration.control_sources import ControlSet, FindPoints
-from amers.app.usecases.registration.deliverables import write_outputs
+from amers.app.usecases.registration.control_sources import FindPoints
 from amers.app.usecases.registration.failure import Attempt, write_failure
 from amers.app.usecases.registration.joined_scenes import (
     SCENES_JSON,
@@ -21,26 +19,21 @@ from amers.app.usecases.registration.joined_scenes import (
     Member,
     format_scenes,
 )
-from amers.app.usecases.registration.register import RegisteredScene, SceneFiles, grown
+from amers.app.usecases.registration.register import (
+    RegisteredScene,
+    SceneFiles,
+    grown,
+    write_registered,
+)
+from amers.app.usecases.report_files import write_report, write_texts
 from amers.services.conventions import MAX_ERROR_SIGMAS
 from amers.services.errors import AmersError, InputError
 from amers.services.formats.adjusted_images import write_adjusted_images
-from amers.services.formats.images.bands import parse_bands
-from amers.services.formats.images.scenes import read_scene
-from amers.services.formats.sensor_models.refined_model import AdjustedRigorous, write_refined
 from amers.services.imagery.scene import Scene, scene_footprint
 from amers.services.joint.registration import AdjustedScenes, JointRegistration, register_together
-from amers.services.joint.results import RigorousScene
-from amers.services.registration.on_points import Registration
 from amers.services.registration.options import RegistrationOptions
-from amers.services.reports.build import build_report, scene_record
-from amers.services.reports.document import format_report
-from amers.services.reports.figure_data import figure_data
 from amers.services.reports.joint import JointReport, joint_report
-from amers.services.reports.joint_pages import format_joint_html, format_joint_tables
-from amers.services.reports.report import RefinedModelRecord, RunRecord
-from amers.services.sensors.base import SensorModel
-from amers.services.sensors.parameter_sets import parameter_set_named
+from amers.services.reports.joint_pages import JOINT_PAGE
 from amers.services.sensors.pushbroom import PushbroomModel
 from amers.services.tasks import Work
 from amers.services.types import Array, Progress, no_progress, part_of
@@ -130,96 +123,121 @@ def run_joint_registration(
         name: Attempt(one.image, command or f"amers scene register-many {one.image.name}", options)
         for name, one in files.items()
     }
-    failed: dict[str, AmersError] = {}
     with ExitStack() as stack:
         before = [] if place.joined is None else _joined(place.joined, stack)
-        read = _read_all(files, place, attempts, failed, stack)
+        scenes = _Scenes(place, attempts, before)
+        scenes.read(files, stack)
         try:
-            if not read:
-                raise InputError(
-                    f"none of {len(files)} scenes can be used: {next(iter(failed.values()))}"
-                )
-            _check_rigorous(read)
-            progress(0.0, "looking for points")
-            control = find_points(_outline([one.scene for one in read]))
-            for one in read:
-                attempts[one.folder].control = control
-            executor, ahead = stack.enter_context(open_executor(place.compute))
-            result = register_together(
-                [one.scene for one in read],
-                control.points,
-                control.chips,
-                options,
-                joined=_adjusted(before, place.joined),
-                work=Work(executor, ahead=ahead),
-                progress=part_of(progress, 0.0, 0.85),
-            )
+            result = _register(scenes, find_points, options, progress)
         except AmersError as error:
-            for name, attempt in attempts.items():
-                write_failure(place.folder_of(name), attempt, failed.get(name, error))
+            scenes.failed = {name: scenes.failed.get(name, error) for name in attempts}
+            scenes.write_failures()
             raise
-        by_name = {one.name: one for one in read}
-        left = [by_name[one.measured.name].folder for one in result.left]
-        for name, gone in zip(left, result.left, strict=True):
-            failed[name] = gone.error
-            attempts[name].stages.extend(gone.measured.stages)
-        for name, why in failed.items():
-            write_failure(place.folder_of(name), attempts[name], why)
-        registered = {}
-        for count, registration in enumerate(result.registrations):
-            progress(0.85 + 0.15 * count / len(result.registrations), "writing the reports")
-            one = by_name[result.block.scenes[result.numbers[count]].name]
-            name = one.folder
-            registered[name] = _written(
-                one,
-                (registration, result.rigorous[count]),
-                control,
-                attempts[name],
-                place.folder_of(name),
-                copy_image=copy_image,
-            )
-        report = joint_report(
-            result,
-            [one.report for one in registered.values()],
-            left,
-            name=place.name,
-            finished_at=datetime.now(UTC),
-        )
-        written = _write_block(place.folder_of(BLOCK_FOLDER), report, result, [*before, *read])
-    return JointOutcome(report, registered, failed, written)
+        return _write(result, scenes, copy_image, progress)
 
 
-def _read_all(
-    files: Mapping[str, SceneFiles],
-    place: JointPlace,
-    attempts: dict[str, Attempt],
-    failed: dict[str, AmersError],
-    stack: ExitStack,
-) -> list[_Read]:
-    """The scenes that can be read, open until the stack closes; the others are noted.
+@dataclass
+class _Scenes:
+    """Scenes on their way to a registration together.
 
-    A scene whose metadata name it like another one gets the name of its folder.
+    Attributes:
+        place: of the work and of the results.
+        attempts: what was done with each, by the name of its folder.
+        before: scenes that were registered before.
+        opened: those that could be read.
+        failed: why others were not registered, by the name of their folder.
     """
-    read: list[_Read] = []
-    taken = {one.name for one in place.joined.members} if place.joined else set()
-    for name, one in files.items():
-        try:
-            scene = _read(one, stack)
-        except InputError as error:
-            failed[name] = error
-            continue
-        if scene.acquisition.image_id in taken:
-            scene = _named(scene, name)
-        if scene.acquisition.image_id in taken:
-            failed[name] = InputError(
-                f"{name}: the scenes that it joins have one of this name already; leave it out, or "
-                "rename the image if it is another one"
-            )
-            continue
-        attempts[name].scene = scene
-        taken.add(scene.acquisition.image_id)
-        read.append(_Read(name, place.address_of(name, one.image), one, scene))
-    return read
+
+    place: JointPlace
+    attempts: Mapping[str, Attempt]
+    before: Sequence[_Read]
+    opened: list[_Read] = field(default_factory=list)
+    failed: dict[str, AmersError] = field(default_factory=dict)
+
+    def read(self, files: Mapping[str, SceneFiles], stack: ExitStack) -> None:
+        """Read the scenes, which stay open until the stack closes; note those that cannot be read.
+
+        A scene whose metadata name it like another one gets the name of its folder.
+        """
+        taken = {one.name for one in self.before}
+        for name, one in files.items():
+            try:
+                scene = _read(one, stack)
+            except InputError as error:
+                self.failed[name] = error
+                continue
+            if scene.acquisition.image_id in taken:
+                scene = _named(scene, name)
+            if scene.acquisition.image_id in taken:
+                self.failed[name] = InputError(
+                    f"{name}: the scenes that it joins have one of this name already; leave it out, or "
+                    "rename the image if it is another one"
+                )
+                continue
+            self.attempts[name].scene = scene
+            taken.add(scene.acquisition.image_id)
+            self.opened.append(_Read(name, self.place.address_of(name, one.image), one, scene))
+
+    def write_failures(self) -> None:
+        """Write the reports of the scenes that were not registered."""
+        for name, why in self.failed.items():
+            write_failure(self.place.folder_of(name), self.attempts[name], why)
+
+
+def _register(
+    scenes: _Scenes, find_points: FindPoints, options: RegistrationOptions, progress: Progress
+) -> JointRegistration:
+    """Scenes registered together on the control points of their ground, which the attempts note."""
+    opened = [one.scene for one in scenes.opened]
+    if not opened:
+        why = next(iter(scenes.failed.values()))
+        raise InputError(f"none of {len(scenes.attempts)} scenes can be used: {why}")
+    _check_rigorous(scenes.opened)
+    progress(0.0, "looking for points")
+    control = find_points(_outline(opened))
+    for one in scenes.opened:
+        scenes.attempts[one.folder].control = control
+    joined = scenes.place.joined
+    before = tuple(one.scene for one in scenes.before)
+    with open_executor(scenes.place.compute) as (executor, ahead):
+        return register_together(
+            opened,
+            control.points,
+            control.chips,
+            options,
+            joined=None if joined is None else AdjustedScenes(before, joined.known),
+            work=Work(executor, ahead=ahead),
+            progress=part_of(progress, 0.0, 0.85),
+        )
+
+
+def _write(
+    result: JointRegistration, scenes: _Scenes, copy_image: bool, progress: Progress
+) -> JointOutcome:
+    """The outputs of each scene and of all; scenes that did not fit join those that failed."""
+    by_name, place = {one.name: one for one in scenes.opened}, scenes.place
+    left = [by_name[one.measured.name].folder for one in result.left]
+    for name, gone in zip(left, result.left, strict=True):
+        scenes.failed[name] = gone.error
+        scenes.attempts[name].stages.extend(gone.measured.stages)
+    scenes.write_failures()
+    registered = {}
+    for k, number in enumerate(result.numbers):
+        progress(0.85 + 0.15 * k / len(result.numbers), "writing the reports")
+        one = by_name[result.block.scenes[number].name]
+        registered[one.folder] = write_registered(
+            one.files,
+            result.registrations[k],
+            scenes.attempts[one.folder],
+            place.folder_of(one.folder),
+            copy_image=copy_image,
+            rigorous=result.rigorous[k],
+        )
+    reports = [one.report for one in registered.values()]
+    report = joint_report(result, reports, left, name=place.name, finished_at=datetime.now(UTC))
+    of_block = place.folder_of(BLOCK_FOLDER)
+    written = _write_block(of_block, report, result, [*scenes.before, *scenes.opened])
+    return JointOutcome(report, registered, scenes.failed, written)
 
 
 def _check_rigorous(read: Sequence[_Read]) -> None:
@@ -234,15 +252,7 @@ def _check_rigorous(read: Sequence[_Read]) -> None:
 
 
 def _read(files: SceneFiles, stack: ExitStack) -> Scene:
-    bands = None if files.bands is None else parse_bands(files.bands)
-    scene = read_scene(
-        files.image,
-        files.model,
-        sigma_m=files.sigma_m,
-        bands=bands,
-        mask=files.mask,
-        parameter_set=None if files.rigorous is None else parameter_set_named(files.rigorous),
-    )
+    scene = files.read()
     stack.callback(scene.image.close)  # type: ignore[attr-defined]
     return scene
 
@@ -270,74 +280,18 @@ def _outline(scenes: Sequence[Scene]) -> Array:
     return np.array(together.exterior.coords)[:-1]
 
 
-def _written(
-    one: _Read,
-    result: tuple[Registration, RigorousScene | None],
-    control: ControlSet,
-    attempt: Attempt,
-    folder: Path,
-    *,
-    copy_image: bool,
-) -> RegisteredScene:
-    """The outputs of one scene, written as those of a scene alone are."""
-    files, scene = one.files, one.scene
-    registration, found = result
-    model: SensorModel | AdjustedRigorous = registration.model
-    if found is not None:
-        model = AdjustedRigorous(
-            registration.model, found.heights_m, found.correction_error_px, found.attitude
-        )
-    folder.mkdir(parents=True, exist_ok=True)
-    refined = write_refined(
-        files.image,
-        files.model,
-        model,
-        registration.adjustment,
-        shape=scene.image.shape,
-        folder=folder,
-        copy_image=copy_image,
-        frame=registration.frame,
-    )
-    report = build_report(
-        registration,
-        scene_record(scene, files.image.stem),
-        RunRecord(
-            software_version=version("amers"),
-            started_at=attempt.started_at,
-            finished_at=datetime.now(UTC),
-            method="control points",
-            blocks=control.blocks,
-            options=attempt.options,
-        ),
-        RefinedModelRecord(refined.max_error_px, refined.note),
-        figure_data(scene, control.points, control.chips, registration),
-        nearest_px=None if found is None else found.correction_error_px,
-    )
-    paths = write_outputs(folder, report, files.image.name, control.points)
-    outputs = {path.name: path for path in (*paths, *refined.files)}
-    return RegisteredScene(scene, registration, None, report, scene_footprint(scene), outputs)
-
-
 def _write_block(
     folder: Path, report: JointReport, result: JointRegistration, read: Sequence[_Read]
 ) -> dict[str, Path]:
     """The report on all scenes, and what later scenes need to join them."""
-    folder.mkdir(parents=True, exist_ok=True)
     adjusted = {one.name: one.scene.model.height_range_m for one in result.block.scenes}
     members = [
         Member(one.name, one.address, one.files, adjusted[one.name])
         for one in read
         if one.name in adjusted
     ]
-    texts = {
-        "report.json": format_report(report),
-        "report.html": format_joint_html(report),
-        "report.txt": format_joint_tables(report),
-        SCENES_JSON: format_scenes(members),
-    }
-    for name, text in texts.items():
-        (folder / name).write_text(text, encoding="utf-8")
-    written = {name: folder / name for name in texts}
+    written = write_report(folder, JOINT_PAGE, report)
+    written |= write_texts(folder, {SCENES_JSON: format_scenes(members)})
     if result.block.adjustment.known is not None:
         write_adjusted_images(folder / IMAGES_NPZ, report.block.id, result.block.adjustment.known)
         written[IMAGES_NPZ] = folder / IMAGES_NPZ
@@ -359,10 +313,3 @@ def _joined(joined: JoinedScenes, stack: ExitStack) -> list[_Read]:
         )
         for one in joined.members
     ]
-
-
-def _adjusted(before: Sequence[_Read], joined: JoinedScenes | None) -> AdjustedScenes | None:
-    """What the adjustment of scenes that were registered before has told of them."""
-    if joined is None:
-        return None
-    return AdjustedScenes(tuple(one.scene for one in before), joined.known)

@@ -20,7 +20,6 @@ from amers.services.reports.block_adjustment import (
     LOOK_AT,
     AdjustmentReport,
     ControlFit,
-    adjustment_document,
 )
 from amers.services.reports.block_adjustment import points_csv as points_of_block
 from amers.services.reports.block_quality import (
@@ -30,7 +29,8 @@ from amers.services.reports.block_quality import (
     block_quality_report,
     degree_words,
 )
-from amers.services.reports.plan import PlanReport, plan_document, points_csv
+from amers.services.reports.document import report_document
+from amers.services.reports.plan import PlanReport, points_csv
 from amers.services.reports.selection import share_words
 from amers.services.types import Frame
 from tests.factories import control_points
@@ -74,7 +74,7 @@ def test_a_plan_states_its_accuracy_relative_first_and_what_each_further_site_ga
 
 
 def test_the_document_of_a_plan_names_what_each_candidate_gains(plan: PlanReport) -> None:
-    document = plan_document(plan)
+    document = report_document(plan)
     assert [one["name"] for one in document["proposed"]] == ["far", "near"]
     assert document["proposed"][0]["gain_m"] == {"near": 0.5, "far": 1.1}
     assert document["proposed"][1]["gain_m"] == {"near": 0.5, "far": None}
@@ -143,7 +143,7 @@ def test_a_block_is_looked_at_for_each_odd_image_and_each_contradiction(
 
 
 def test_the_document_of_an_adjustment_has_residuals_before_and_after_and_no_unknown_height() -> None:
-    document = adjustment_document(adjusted())
+    document = report_document(adjusted())
     assert document["residuals_px"] == {"delivered": 9.0, "adjusted": 0.3, "points": 0.2}
     assert document["control"][0]["misfit_m"] == [0.5, -0.5, None]
     assert document["on_the_earth"]["le90_m"] > document["relative_to_control_points"]["le90_m"]

@@ -8,9 +8,9 @@ import pytest
 
 from amers.services.quality.criteria import Criterion, at_least, at_most
 from amers.services.reports.criteria_rows import NOT_USABLE, criterion_rows, unmet_criteria
-from amers.services.reports.html import centre_words
 from amers.services.reports.published import published_tables
 from amers.services.reports.reasons import count_reasons
+from amers.services.reports.scene_words import centre_words
 from tests.services.conftest import Registered
 from tests.services.reports.conftest import Material
 

@@ -28,8 +28,10 @@ from amers.services.reports.failure import (
     next_steps,
     significance_words,
 )
-from amers.services.reports.failure_pages import format_failure_html, format_failure_tables
+from amers.services.reports.failure_pages import FAILURE_PAGE
+from amers.services.reports.html import format_html
 from amers.services.reports.report import RunRecord
+from amers.services.reports.text import format_text
 from tests.services.reports.test_html import HOSTILE, Page
 
 COMMAND = "amers scene register scene.tif --block points -o out"
@@ -88,7 +90,7 @@ def test_the_document_follows_its_schema_and_has_no_figure_of_a_result(report):
 
 def test_page_and_text_state_search_candidates_reasons_and_commands(report):
     made = failure(report)
-    page, text = format_failure_html(made), format_failure_tables(made)
+    page, text = format_html(FAILURE_PAGE, made), format_text(FAILURE_PAGE, made)
     shown = " ".join(Page(page).texts)
     for words in ("coarse", "150.0 m", "60", "31.0", "-25.5", "correlation too low", "44", COMMAND):
         assert words in shown, words
@@ -103,11 +105,13 @@ def test_page_and_text_state_search_candidates_reasons_and_commands(report):
 
 def test_hostile_names_stay_text(report):
     scene = replace(report.scene, name=HOSTILE)
-    page = Page(format_failure_html(failure(report, scene=scene, error=NoConsensus(HOSTILE))))
+    hostile = failure(report, scene=scene, error=NoConsensus(HOSTILE))
+    page = Page(format_html(FAILURE_PAGE, hostile))
     assert "script" not in page.tags
     assert HOSTILE in page.texts
     assert not [value for _, value in page.attributes if value and value.startswith("http")]
-    assert HOSTILE in format_failure_tables(failure(report, scene=UnreadScene(HOSTILE), stages=()))
+    unread = failure(report, scene=UnreadScene(HOSTILE), stages=())
+    assert HOSTILE in format_text(FAILURE_PAGE, unread)
 
 
 def test_a_larger_sigma_comes_first_when_the_peaks_lie_at_the_border(report):

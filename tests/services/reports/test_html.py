@@ -15,11 +15,13 @@ from amers.services.reports.charts import funnel
 from amers.services.reports.criteria_rows import margin_words
 from amers.services.reports.drawing import ACTIVE, ARROW, round_number
 from amers.services.reports.figure_data import Quicklook
-from amers.services.reports.figures import FIGURES, figure_markup
-from amers.services.reports.html import chip_uri, choose_comparisons, flat_options, format_html
+from amers.services.reports.gallery import chip_uri, choose_comparisons
+from amers.services.reports.html import figure_markup, format_html
 from amers.services.reports.maps import coverage_map, residual_map
 from amers.services.reports.numbers import metres, number
 from amers.services.reports.plot import tick_words, ticks
+from amers.services.reports.registration_pages import FIGURES, REGISTRATION_PAGE
+from amers.services.reports.scene_words import flat_options
 from amers.services.types import Acquisition
 
 HOSTILE = "<script>alert('x')</script>\"&$\\frac"
@@ -54,7 +56,7 @@ class Page(HTMLParser):
 
 
 def page(made):
-    return format_html(made.report())
+    return format_html(REGISTRATION_PAGE, made.report())
 
 
 def without_points(made):
@@ -109,7 +111,7 @@ def test_the_verdict_comes_first_with_the_numbers_that_cost_it(material):
 
 def test_the_predicted_accuracy_stands_in_a_table_relative_first_then_on_the_earth(material):
     report = material().report()
-    texts = [text for text in Page(format_html(report)).texts if text]
+    texts = [text for text in Page(format_html(REGISTRATION_PAGE, report)).texts if text]
     below = texts[texts.index("Predicted CE90") :]
     predicted = report.predicted
     assert below[1:11] == [
@@ -166,7 +168,7 @@ def test_hostile_names_are_shown_and_not_run(material):
         checks=checks,
     ).report()
     report = replace(report, correction=replace(report.correction, order_reason=HOSTILE))
-    parsed = Page(format_html(report))
+    parsed = Page(format_html(REGISTRATION_PAGE, report))
     assert "script" not in parsed.tags
     assert HOSTILE in parsed.texts
 
@@ -365,7 +367,7 @@ def test_the_scale_arrow_has_a_round_length(value, rounded):
 
 def test_each_criterion_stands_once_with_the_level_it_reaches(material):
     report = material(n=12, lost=0, wrong=0).report()
-    markup = format_html(report)
+    markup = format_html(REGISTRATION_PAGE, report)
     table = markup[markup.index("<h2>Criteria</h2>") :]
     for name in {criterion.name for criterion in report.criteria}:
         levels = [criterion for criterion in report.criteria if criterion.name == name]

@@ -11,7 +11,8 @@ from amers.services.quality.accuracy import sample_quantile
 from amers.services.reports.document import report_document
 from amers.services.reports.html import format_html
 from amers.services.reports.numbers import number, quantile
-from amers.services.reports.tables import format_tables
+from amers.services.reports.registration_pages import REGISTRATION_PAGE
+from amers.services.reports.text import format_text
 
 
 def row(text, start):
@@ -26,7 +27,7 @@ def row(text, start):
 def test_the_table_of_point_counts_has_the_published_columns_and_the_counts(material):
     made = material(name="scene A")
     active = int(made.measures.active.sum())
-    text = format_tables(made.report())
+    text = format_text(REGISTRATION_PAGE, made.report())
     assert row(text, "Scene")[1:] == ["Popini", "Spatio", "Actif", "Actif/Spatio", "Actif/Popini"]
     assert row(text, "scene A")[1:] == [
         "60",
@@ -40,7 +41,7 @@ def test_the_table_of_point_counts_has_the_published_columns_and_the_counts(mate
 def test_the_residual_table_says_mean_and_deviation_of_each_coordinate(material):
     made = material()
     residual = made.measures.residual_px[made.measures.active]
-    text = format_tables(made.report())
+    text = format_text(REGISTRATION_PAGE, made.report())
     assert row(text, "x (sample)")[1] == str(len(residual))
     assert row(text, "x (sample)")[3] == f"{residual[:, 1].std(ddof=1):.3f}"
     assert row(text, "y (line)")[3] == f"{residual[:, 0].std(ddof=1):.3f}"
@@ -50,7 +51,7 @@ def test_the_residual_table_says_mean_and_deviation_of_each_coordinate(material)
 
 
 def test_the_stability_table_says_what_it_does_not_show(report):
-    text = " ".join(format_tables(report).split())
+    text = " ".join(format_text(REGISTRATION_PAGE, report).split())
     assert "Shows stability, not absolute accuracy." in text
     assert "top left" in text
 
@@ -58,7 +59,10 @@ def test_the_stability_table_says_what_it_does_not_show(report):
 def test_hold_outs_by_cells_stand_beside_those_at_random_with_what_they_show(material):
     report = material(n=200).report()
     means = report.cell_stability.group_means
-    pages = (format_tables(report), re.sub("<[^>]+>", "", unescape(format_html(report))))
+    pages = (
+        format_text(REGISTRATION_PAGE, report),
+        re.sub("<[^>]+>", "", unescape(format_html(REGISTRATION_PAGE, report))),
+    )
     for text in (" ".join(page.split()) for page in pages):
         assert text.index("Shows stability" if "Shows" in text else "shows stability") < text.index(
             "Stability by cells"
@@ -74,7 +78,7 @@ def test_hold_outs_by_cells_stand_beside_those_at_random_with_what_they_show(mat
 
 
 def test_an_unmet_criterion_stands_out_with_its_value_and_limit(material):
-    text = format_tables(material(n=12, lost=0, wrong=0).report())
+    text = format_text(REGISTRATION_PAGE, material(n=12, lost=0, wrong=0).report())
     assert row(text, "Active points")[2:] == ["at least 20", "good", "NO"]
     assert int(row(text, "Active points")[1]) <= 12
     assert "Verdict: usable" in text or "Verdict: failed" in text
@@ -82,7 +86,7 @@ def test_an_unmet_criterion_stands_out_with_its_value_and_limit(material):
 
 def test_names_with_brackets_are_shown_as_they_are(report):
     scene = replace(report.scene, name="[bold]x[/bold]")
-    text = format_tables(replace(report, scene=scene))
+    text = format_text(REGISTRATION_PAGE, replace(report, scene=scene))
     assert "Registration of [bold]x[/bold]\nVerdict: good, relative" in text
     assert row(text, "[bold]x[/bold]")[1] == "60"
 
