@@ -7,24 +7,18 @@ import numpy as np
 
 from amers.services.adjustment.block_accuracy import (
     BlockAccuracy,
-    block_accuracy,
     carried_covariances,
     earth_frames,
     joint_relative,
 )
 from amers.services.adjustment.block_problem import BlockOptions, BlockProblem
-from amers.services.adjustment.block_scale import LEAST_SCALE, check_scale, posterior_scale
-from amers.services.adjustment.block_solution import checked_gauge, least_squares
-from amers.services.adjustment.control_check import (
-    agreeing_control,
-    check_place_of_control,
-    ray_coordinates,
-)
+from amers.services.adjustment.control_check import check_place_of_control
 from amers.services.adjustment.control_ground import NO_CONTROL, ControlGround
 from amers.services.adjustment.known_images import KnownImages, known_images, tie
 from amers.services.adjustment.parameters import AdjustableImage, BlockPriors, block_priors
 from amers.services.adjustment.reduced_system import DENSE_ROWS, ReducedSystem
-from amers.services.adjustment.robust_start import active_observations, robust_start, started
+from amers.services.adjustment.robust_start import robust_start, started
+from amers.services.adjustment.settled_block import Round, Weighing, settled
 from amers.services.errors import InputError, NoConsensus
 from amers.services.sensors.base import SensorModel
 from amers.services.types import Array, BoolArray, Frame, IntArray, Observations
@@ -75,15 +69,6 @@ class BlockAdjustment:
     iterations: int
 
 
-_SLOPE_OBSERVATIONS = 0.3
-"""Drifts and skews that what is stated of them counts for, when their variance is estimated. A pair
-shows two, and those may be small by chance: counted for one, regions of 90 % hold 75 % where images
-drift more."""
-_ROUNDS = 15
-_SETTLED = 0.02
-"""Relative change of the scales at which they have settled."""
-
-
 def adjust_block(
     images: Sequence[AdjustableImage],
     observations: Observations,
@@ -129,89 +114,76 @@ def adjust_block(
     n_points = int(observations.point[-1]) + 1 if len(observations) else 0
     problem = BlockProblem(images, observations, control, options, n_points, priors.size, tied)
     _check_heights(problem)
+    start = _start(problem, priors, like)
+    _check_control(control, start.control_active)
+    return _stated(problem, settled(problem, start, once=like is not None), passes)
+
+
+def _start(problem: BlockProblem, priors: BlockPriors, like: BlockAdjustment | None) -> Weighing:
+    """A robust solution, or all observations on what an adjustment of more of them has found."""
     if like is None:
         check_place_of_control(problem, problem.start_values())
         state, scale, active, control_active = robust_start(problem, priors)
-        slope_factor = 1.0
-    else:
-        state, scale, slope_factor = started(problem, like.values), like.sigma_px, like.slope_factor
-        active = np.ones(len(observations), dtype=np.bool_)
-        control_active = np.ones(len(control), dtype=np.bool_)
-        priors = priors.with_slopes(slope_factor)
-    _check_control(control, control_active)
-    used = active
-    for _ in range(_ROUNDS):
-        weight = problem.weights(active / problem.scales(max(scale, LEAST_SCALE)) ** 2, control_active)
-        equations = problem.equations(state.values, state.lon_lat_h, weight)
-        gauge = checked_gauge(problem, equations, state.lon_lat_h)
-        solved = least_squares(problem, priors, gauge, state, weight)
-        state = solved.state
-        accuracy = block_accuracy(solved.system, problem.pairs, gauge, len(images) * priors.size)
-        before, used, previous = used, active, (scale, slope_factor)
-        square = problem.squares(state.values, state.lon_lat_h)
-        determined = _determined(solved.system.priors, accuracy.variance())
-        computed = used & np.isfinite(square) & ~problem.by_hand
-        coordinates = ray_coordinates(problem, solved.equations, solved.points)
-        # What people marked determines the parameters as well.
-        own = float(determined.sum()) * float(computed.sum()) / max(float(used.sum()), 1.0)
-        scale = posterior_scale(square[computed], observations.point[computed], coordinates, own)
-        check_scale(scale)
-        factor = _slope_factor(state.values.ravel(), solved.system.priors, determined, slope_factor)
-        active = active_observations(
-            problem, square, used, scale, control_active, coordinates=coordinates
-        )
-        used_control, control_active = (
-            control_active,
-            agreeing_control(problem, solved.equations, solved.points, accuracy, control_active),
-        )
-        # Observations at the limit of the tolerance would come back and leave for ever: they stay out.
-        again = np.array_equal(active, before) and bool((used <= active).all())
-        same = again or np.array_equal(active, used)
-        settled = same and np.array_equal(control_active, used_control)
-        settled = settled and np.allclose((scale, slope_factor * factor), previous, rtol=_SETTLED)
-        if settled or like is not None:
-            break
-        priors, slope_factor = priors.with_slopes(factor), slope_factor * factor
-    # Known ground that no image shows any more, as its rays have left, takes no part.
-    shown = np.isin(control.point, observations.point[used])
-    used_control = used_control & shown
-    # A height alone contradicts nothing where no two rays show its point.
-    _check_control(control, used_control | ~shown & ~control.known[:, :2].any(axis=1))
-    of_points = np.full(n_points, -1)
-    of_points[observations.point[used][::-1]] = gauge.group[observations.image[used][::-1]]
+        return Weighing(state, priors, scale, 1.0, active, control_active)
+    return Weighing(
+        started(problem, like.values),
+        priors.with_slopes(like.slope_factor),
+        like.sigma_px,
+        like.slope_factor,
+        np.ones(len(problem.observations), dtype=np.bool_),
+        np.ones(len(problem.control), dtype=np.bool_),
+    )
+
+
+def _stated(problem: BlockProblem, last: Round, passes: Sequence[BoolArray]) -> BlockAdjustment:
+    """What the last least squares state of images, points and frames."""
+    images, observations, control = problem.images, problem.observations, problem.control
+    solved, state, accuracy, group = last.solved, last.solved.state, last.accuracy, last.gauge.group
+    used = last.before.active
+    control_active = _shown_control(control, observations.point[used], last.before.control_active)
+    of_points = np.full(problem.n_points, -1)
+    of_points[observations.point[used][::-1]] = group[observations.image[used][::-1]]
     carried_m2 = carried_covariances(solved.equations, solved.points, accuracy, of_points)
     intersected = (of_points >= 0) & np.isfinite(solved.points.inverse[:, 0, 0])
     relative_m2 = solved.points.inverse + carried_m2
-    frames = [
-        replace(frame, shared_m2=carried_m2[intersected & (of_points == group)].mean(axis=0))
-        for group, frame in enumerate(earth_frames(accuracy, solved.system.priors, images, passes, tied))
-    ]
-    residual = problem.equations(state.values, state.lon_lat_h).residual
+    on_earth = earth_frames(accuracy, solved.system.priors, images, passes, problem.tie)
+    frames = tuple(
+        replace(frame, shared_m2=carried_m2[intersected & (of_points == number)].mean(axis=0))
+        for number, frame in enumerate(on_earth)
+    )
+    residual_px = problem.image_rows(problem.equations(state.values, state.lon_lat_h).residual)
     lon_lat_h = state.lon_lat_h.copy()
     lon_lat_h[:, 0] -= 360.0 * np.round(lon_lat_h[:, 0] / 360.0)
-    misfit_m = problem.control_misfit_m(state.values, state.lon_lat_h)
-    n_images = len(images)
+    of_control_m = problem.control_misfit_m(state.values, state.lon_lat_h)
     return BlockAdjustment(
         models=tuple(
             image.corrected(found[: len(image.sigma)])
-            for image, found in zip(images, state.values[:n_images], strict=True)
+            for image, found in zip(images, state.values[: len(images)], strict=True)
         ),
-        values=state.values[:n_images],
-        determined=determined.reshape(state.values.shape)[:n_images],
+        values=state.values[: len(images)],
+        determined=last.determined.reshape(state.values.shape)[: len(images)],
         accuracy=accuracy,
-        slope_factor=slope_factor,
+        slope_factor=last.before.slope_factor,
         lon_lat_h=np.where(intersected[:, None], lon_lat_h, np.nan),
         point_covariance_m2=np.where(intersected[:, None, None], relative_m2, np.nan),
-        group=gauge.group[:n_images],
-        known=_known(images, state.values, gauge.group, frames, of=(solved.system, accuracy)),
-        frames=tuple(frames),
-        residual_px=problem.image_rows(residual) * observations.sigma_px[:, None],
+        group=group[: len(images)],
+        known=_known(images, state.values, group, frames, of=(solved.system, accuracy)),
+        frames=frames,
+        residual_px=residual_px * observations.sigma_px[:, None],
         active=used & intersected[observations.point],
-        control_active=used_control,
-        control_misfit_m=np.where(control.known, misfit_m, np.nan),
-        sigma_px=scale,
+        control_active=control_active,
+        control_misfit_m=np.where(control.known, of_control_m, np.nan),
+        sigma_px=last.after.scale,
         iterations=state.iterations,
     )
+
+
+def _shown_control(control: ControlGround, seen: IntArray, active: BoolArray) -> BoolArray:
+    """Active control (c,) whose points are `seen`: what no image shows any more takes no part."""
+    shown = np.isin(control.point, seen)
+    # A height alone contradicts nothing where no two rays show its point.
+    _check_control(control, active & shown | ~shown & ~control.known[:, :2].any(axis=1))
+    return active & shown
 
 
 def _known(
@@ -232,24 +204,6 @@ def _known(
     relative = joint_relative(*of)[np.ix_(inside, inside)]
     members = [images[row] for row in rows.tolist()]
     return known_images(members, values[rows, :own], relative, frames[0])
-
-
-def _determined(priors: BlockPriors, variance: Array) -> Array:
-    """Share (K,) of every parameter that observations determine, the rest being its prior."""
-    return np.clip(1.0 - variance * (priors.locating.diagonal() + priors.shape), 0.0, 1.0)
-
-
-def _slope_factor(values: Array, priors: BlockPriors, determined: Array, so_far: float) -> float:
-    """By how much the standard deviation of drifts and skews changes (MacKay's fixed point)."""
-    slopes = priors.estimated & (priors.shape > 0.0)
-    if not slopes.any():
-        return 1.0
-    stated = priors.shape[slopes] * so_far**2
-    found = float((values[slopes] ** 2 * stated).sum())
-    freedom = _SLOPE_OBSERVATIONS + float(determined[slopes].sum())
-    # Few slopes tell their variance badly: regions of Student's law, relative to the normal law's.
-    few = freedom * (0.1 ** (-2.0 / freedom) - 1.0) / (2.0 * np.log(10.0))
-    return float(np.sqrt((_SLOPE_OBSERVATIONS + found) / freedom * few) / so_far)
 
 
 def _check_heights(problem: BlockProblem) -> None:
