@@ -86,11 +86,36 @@ def with_control(
     Raises:
         NotEnoughPoints: too few points of a source are found.
     """
-    observations, ground = [points.measures], []
+    first = len(points.lon_lat_h)
+    observations, ground = [points.measures], _told_of(scenes, points, control, work, progress)
+    if control.blocks:
+        found, known = find_control(
+            scenes,
+            points.frame,
+            control.blocks,
+            first_point=first,
+            work=work,
+            progress=progress,
+        )
+        observations.append(found)
+        ground.append(known)
+        first += len(known)
+    for marked in control.marked:
+        marks, known = known_marks(marked, first)
+        observations.append(marks)
+        ground.append(known)
+        first += len(known)
+    return joined_observations(observations), joined_ground(ground)
+
+
+def _told_of(
+    scenes: Sequence[Scene], points: MeasuredPoints, control: Control, work: Work, progress: Progress
+) -> list[ControlGround]:
+    """What ortho-images and elevation models tell of the points of a block."""
     at = points.measured(scenes)
     rows = np.flatnonzero(np.isfinite(at).all(axis=1))
     share = 1.0 / (1 + len(control.orthos) + bool(control.heights))
-    ground += [ortho_heights(scenes, points.measures, heights) for heights in control.heights]
+    ground = [ortho_heights(scenes, points.measures, heights) for heights in control.heights]
     placed = np.unique(np.concatenate([rows, *(known.point for known in ground)]))
     for number, ortho in enumerate(control.orthos):
         known = known_on_ortho(
@@ -112,22 +137,4 @@ def with_control(
         for heights in control.heights:
             known = known_heights(at[rows], above, points.frame.sigma_m, heights)
             ground.append(replace(known, point=rows[known.point]))
-    first = len(points.lon_lat_h)
-    if control.blocks:
-        found, known = find_control(
-            scenes,
-            points.frame,
-            control.blocks,
-            first_point=first,
-            work=work,
-            progress=progress,
-        )
-        observations.append(found)
-        ground.append(known)
-        first += len(known)
-    for marked in control.marked:
-        marks, known = known_marks(marked, first)
-        observations.append(marks)
-        ground.append(known)
-        first += len(known)
-    return joined_observations(observations), joined_ground(ground)
+    return ground

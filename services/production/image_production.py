@@ -8,7 +8,7 @@ import numpy as np
 
 from amers.services.adjustment.block_problem import BlockOptions
 from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
-from amers.services.adjustment.control_ground import NO_CONTROL, ControlGround, joined_ground
+from amers.services.adjustment.control_ground import ControlGround, joined_ground
 from amers.services.adjustment.intersection import intersect, residuals_and_derivatives
 from amers.services.adjustment.known_images import KnownImages
 from amers.services.adjustment.observation_noise import found_noise
@@ -22,7 +22,7 @@ from amers.services.matching.multi_image import RefinementOptions, chip_inside
 from amers.services.matching.predict import rank_in_group
 from amers.services.production.block_residuals import ImageFit, PointFits, image_fits, point_fits
 from amers.services.production.control import Control, MeasuredPoints, with_control
-from amers.services.production.ground_parts import CutPoints, cut_points, measure_points
+from amers.services.production.ground_parts import cut_points, measure_points
 from amers.services.production.height_control import ortho_heights
 from amers.services.production.image_passes import image_passes
 from amers.services.production.point_views import check_image_names, shows_chip
@@ -163,19 +163,130 @@ def produce_points(
     begun = time.thread_time()
     work = work or Work()
     passes = image_passes([scene.acquisition for scene in scenes])
-    ties = find_tie_points(scenes, passes, options.features, work, part_of(progress, 0.0, 0.5))
+    images = _Images(scenes, passes, options, control.neighbour)
+    ties = _ties(images, work, part_of(progress, 0.0, 0.5))
+    progress(0.5, "adjusting the block")
+    flat = joined_ground([ortho_heights(scenes, ties, heights) for heights in control.heights])
+    tied = images.adjusted(ties, flat)
+    candidates = _candidates(images.placed(tied), tied, ties, options, excluded)
+    measured = _measured(images, tied, candidates, control, work=work, progress=progress)
+    progress(0.8, "adjusting the block on its chips")
+    measured, adjustment = images.adjusted_with_noise(measured)
+    chosen = _chosen(images, measured, adjustment, excluded)
+    points, chips = _cut_out(images, adjustment, chosen, work, part_of(progress, 0.8, 0.2))
+    progress(1.0, f"{len(points)} points")
+    return Production(
+        points,
+        chips,
+        adjustment,
+        _relative_accuracy(tied, adjustment, before_px=_residual_px(scenes, ties, flat)),
+        box_around(points.lon_lat_h),
+        measured.known,
+        image_fits(scenes, measured.measures, adjustment),
+        point_fits(chosen.rows, measured.measures, adjustment),
+        {**work.effort, "adjustment": Effort(1, time.thread_time() - begun)},
+    )
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """Candidates, and behind them the points of the control.
+
+    Attributes:
+        measures: on chips.
+        known: ground of some points.
+        saliency: (n,) of the candidates.
+    """
+
+    measures: Observations
+    known: ControlGround
+    saliency: Array
+
+
+@dataclass(frozen=True)
+class _Images:
+    """The images of a block with their models as delivered, and how they are adjusted.
+
+    Attributes:
+        scenes: of the block.
+        passes: masks of images that may share errors.
+        options: of the block.
+        neighbour: images of an adjusted block; None without one.
+    """
+
+    scenes: Sequence[Scene]
+    passes: Sequence[BoolArray]
+    options: ProductionOptions
+    neighbour: KnownImages | None
+
+    def adjusted(self, observations: Observations, control: ControlGround) -> BlockAdjustment:
+        """The block adjustment of the images."""
+        images = [
+            image_parameters(
+                scene.acquisition.image_id,
+                scene.model,
+                scene.image.shape,
+                shift_px=scene.sigma_m / scene_gsd_m(scene),
+                slope_px=self.options.slope * max(scene.image.shape) / 2.0,
+            )
+            for scene in self.scenes
+        ]
+        return adjust_block(
+            images,
+            observations,
+            control=control,
+            neighbour=self.neighbour,
+            passes=self.passes,
+            options=self.options.block,
+        )
+
+    def adjusted_with_noise(self, measured: _Measured) -> tuple[_Measured, BlockAdjustment]:
+        """The measures with the noise that their residuals show, and the block adjustment on them."""
+        measures, known = measured.measures, measured.known
+        adjustment = self.adjusted(measures, known)
+        for _ in range(_ROUNDS_OF_NOISE):
+            by_hand = known.marks(measures.point)
+            correlated = adjustment.active & ~by_hand
+            used, residual_px = measures.take(correlated), adjustment.residual_px[correlated]
+            noise = found_noise(used, adjustment.models, adjustment.lon_lat_h, residual_px)
+            if noise.own2_px2 == 0.0:
+                # What is in proportion to the stated sigmas is in the scale of the adjustment.
+                break
+            sigma_px = np.where(by_hand, measures.sigma_px, noise.applied(measures.sigma_px))
+            measures = replace(measures, sigma_px=sigma_px)
+            adjustment = self.adjusted(measures, known)
+        return replace(measured, measures=measures), adjustment
+
+    def placed(self, adjustment: BlockAdjustment) -> list[Scene]:
+        """The scenes with their adjusted models."""
+        pairs = zip(self.scenes, adjustment.models, strict=True)
+        return [replace(scene, model=model) for scene, model in pairs]
+
+
+def _ties(images: _Images, work: Work, progress: Progress) -> Observations:
+    """The tie points of the images."""
+    options = images.options
+    ties = find_tie_points(images.scenes, images.passes, options.features, work, progress)
     if len(ties) == 0:
         raise NotEnoughPoints(
             0, options.block.min_points, "tie points: the images have nothing in common"
         )
-    progress(0.5, "adjusting the block")
-    flat = joined_ground([ortho_heights(scenes, ties, heights) for heights in control.heights])
-    tied = _adjust(scenes, passes, ties, options, flat, neighbour=control.neighbour)
-    before_px = _residual_px(scenes, ties, flat)
+    return ties
 
-    candidates = _candidates(_with_models(scenes, tied), tied, ties, options, excluded)
+
+def _measured(
+    images: _Images,
+    tied: BlockAdjustment,
+    candidates: Array,
+    control: Control,
+    *,
+    work: Work,
+    progress: Progress,
+) -> _Measured:
+    """Candidates (n, 3) and the control, measured in the images as tie points have adjusted them."""
+    scenes, options = images.placed(tied), images.options
     measures, saliency = measure_points(
-        _with_models(scenes, tied),
+        scenes,
         candidates,
         options.fine_gsd_m,
         options.refinement,
@@ -183,65 +294,49 @@ def produce_points(
         progress=part_of(progress, 0.5, 0.25),
     )
     measures, known = with_control(
-        _with_models(scenes, tied),
+        scenes,
         MeasuredPoints(candidates, tied.frames[0], options.fine_gsd_m, measures),
         control,
         work=work,
         progress=part_of(progress, 0.75, 0.05),
     )
-    progress(0.8, "adjusting the block on its chips")
-    adjustment = _adjust(scenes, passes, measures, options, known, neighbour=control.neighbour)
-    for _ in range(_ROUNDS_OF_NOISE):
-        by_hand = known.marks(measures.point)
-        correlated = adjustment.active & ~by_hand
-        used, residual_px = measures.take(correlated), adjustment.residual_px[correlated]
-        noise = found_noise(used, adjustment.models, adjustment.lon_lat_h, residual_px)
-        if noise.own2_px2 == 0.0:
-            # What is in proportion to the stated sigmas is in the scale of the adjustment.
-            break
-        sigma_px = np.where(by_hand, measures.sigma_px, noise.applied(measures.sigma_px))
-        measures = replace(measures, sigma_px=sigma_px)
-        adjustment = _adjust(scenes, passes, measures, options, known, neighbour=control.neighbour)
-    active = measures.take(adjustment.active & (measures.point < len(candidates)))
-    adjusted = _with_models(scenes, adjustment)
-    shown = active.take(shows_chip(adjusted, active, adjustment.lon_lat_h, options.fine_gsd_m))
-    # Points of the control, candidates that nothing measures, and those that have moved onto excluded
-    # ground are not selected.
-    saliency = np.append(saliency, np.zeros(len(known)))[: len(adjustment.lon_lat_h)]
+    return _Measured(measures, known, saliency)
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """The points that are kept.
+
+    Attributes:
+        rows: (k,) of an adjustment.
+        saliency: (k,) of their chips.
+        shown: their measures that become views; `point` is 0 to k - 1.
+    """
+
+    rows: IntArray
+    saliency: Array
+    shown: Observations
+
+
+def _chosen(
+    images: _Images, measured: _Measured, adjustment: BlockAdjustment, excluded: GroundMask | None
+) -> _Chosen:
+    """The best point of every square, of those that images show whole and that are not excluded.
+
+    Points of the control, candidates that nothing measures, and those that have moved onto excluded
+    ground are not chosen.
+    """
+    measures, options = measured.measures, images.options
+    active = measures.take(adjustment.active & (measures.point < len(measured.saliency)))
+    whole = shows_chip(images.placed(adjustment), active, adjustment.lon_lat_h, options.fine_gsd_m)
+    shown = active.take(whole)
+    saliency = np.append(measured.saliency, np.zeros(len(measured.known)))[: len(adjustment.lon_lat_h)]
     if excluded is not None:
         saliency[excluded(adjustment.lon_lat_h[:, :2])] = 0.0
-    rows = _select_points(adjustment, saliency, shown, _dates(shown, passes, len(saliency)), options)
+    dates = _dates(shown, images.passes, len(saliency))
+    rows = _select_points(adjustment, saliency, shown, dates, options)
     shown = shown.take(np.isin(shown.point, rows))
-    shown = replace(shown, point=np.searchsorted(rows, shown.point))
-    cut = cut_points(
-        adjusted,
-        adjustment.lon_lat_h[rows],
-        shown,
-        options.gsds_m,
-        work=work,
-        progress=part_of(progress, 0.8, 0.2),
-    )
-    points = _control_points(adjustment, rows, saliency[rows], cut)
-    relative_accuracy = RelativeAccuracy(
-        tie_points=int(np.isfinite(tied.lon_lat_h[:, 0]).sum()),
-        before_px=_median_px(before_px),
-        after_px=_median_px(tied.residual_px),
-        refined_px=_median_px(adjustment.residual_px[adjustment.active]),
-        frame=adjustment.frames[0],
-    )
-    progress(1.0, f"{len(points)} points")
-    own = Effort(1, time.thread_time() - begun)
-    return Production(
-        points,
-        cut.chips,
-        adjustment,
-        relative_accuracy,
-        box_around(points.lon_lat_h),
-        known,
-        image_fits(scenes, measures, adjustment),
-        point_fits(rows, measures, adjustment),
-        {**work.effort, "adjustment": own},
-    )
+    return _Chosen(rows, saliency[rows], replace(shown, point=np.searchsorted(rows, shown.point)))
 
 
 def _check_scenes(scenes: Sequence[Scene]) -> None:
@@ -250,47 +345,25 @@ def _check_scenes(scenes: Sequence[Scene]) -> None:
     check_image_names(scenes)
 
 
-def _adjust(
-    scenes: Sequence[Scene],
-    passes: Sequence[BoolArray],
-    observations: Observations,
-    options: ProductionOptions,
-    control: ControlGround = NO_CONTROL,
-    *,
-    neighbour: KnownImages | None,
-) -> BlockAdjustment:
-    """The block adjustment of scenes with their models as delivered."""
-    images = [
-        image_parameters(
-            scene.acquisition.image_id,
-            scene.model,
-            scene.image.shape,
-            shift_px=scene.sigma_m / scene_gsd_m(scene),
-            slope_px=options.slope * max(scene.image.shape) / 2.0,
-        )
-        for scene in scenes
-    ]
-    return adjust_block(
-        images,
-        observations,
-        control=control,
-        neighbour=neighbour,
-        passes=passes,
-        options=options.block,
-    )
-
-
-def _with_models(scenes: Sequence[Scene], adjustment: BlockAdjustment) -> list[Scene]:
-    """The scenes with their adjusted models."""
-    return [replace(scene, model=model) for scene, model in zip(scenes, adjustment.models, strict=True)]
-
-
 def _residual_px(scenes: Sequence[Scene], ties: Observations, flat: ControlGround) -> Array:
     """Residuals (m, 2) with the models as delivered, where rays intersect or lie on a known height."""
     models = [scene.model for scene in scenes]
     lon_lat_h = intersect(models, ties, int(ties.point[-1]) + 1).lon_lat_h
     lon_lat_h[flat.point] = flat.lon_lat_h
     return residuals_and_derivatives(models, ties, lon_lat_h)[0]
+
+
+def _relative_accuracy(
+    tied: BlockAdjustment, adjustment: BlockAdjustment, *, before_px: Array
+) -> RelativeAccuracy:
+    """How well the images agree: before (m, 2), on tie points, on chips."""
+    return RelativeAccuracy(
+        tie_points=int(np.isfinite(tied.lon_lat_h[:, 0]).sum()),
+        before_px=_median_px(before_px),
+        after_px=_median_px(tied.residual_px),
+        refined_px=_median_px(adjustment.residual_px[adjustment.active]),
+        frame=adjustment.frames[0],
+    )
 
 
 def _median_px(residual: Array) -> float:
@@ -385,18 +458,26 @@ def _dates(shown: Observations, passes: Sequence[BoolArray], count: int) -> IntA
     return np.bincount(seen[:, 0], minlength=count).astype(np.int64)
 
 
-def _control_points(
-    adjustment: BlockAdjustment, rows: IntArray, saliency: Array, cut: CutPoints
-) -> ControlPoints:
-    """The selected rows of an adjustment as control points of one chip file."""
-    n = len(rows)
-    return ControlPoints(
+def _cut_out(
+    images: _Images, adjustment: BlockAdjustment, chosen: _Chosen, work: Work, progress: Progress
+) -> tuple[ControlPoints, Callable[[int], ChipArray]]:
+    """The chosen points as control points of one chip file, and the chips of each."""
+    rows, n = chosen.rows, len(chosen.rows)
+    cut = cut_points(
+        images.placed(adjustment),
+        adjustment.lon_lat_h[rows],
+        chosen.shown,
+        images.options.gsds_m,
+        work=work,
+        progress=progress,
+    )
+    points = ControlPoints(
         id=np.arange(n, dtype=np.int64),
         lon_lat_h=adjustment.lon_lat_h[rows],
         covariance_m2=adjustment.point_covariance_m2[rows],
         block=np.zeros(n, dtype=np.int64),
         frames=adjustment.frames,
-        saliency=saliency,
+        saliency=chosen.saliency,
         health=np.ones(n),
         views=cut.views,
         chip_file=np.zeros(n, dtype=np.int64),
@@ -404,3 +485,4 @@ def _control_points(
         chip_files=("chips",),
         surface=cut.surface,
     )
+    return points, cut.chips

@@ -11,7 +11,7 @@ from amers.services.errors import ComputationError
 from amers.services.geodesy import east_north_up, longitudes_near, move_metres
 from amers.services.imagery.scene import Scene, scene_footprint, scene_gsd_m
 from amers.services.matching.predict import rank_in_group
-from amers.services.misfit.image_correction import SceneAdjustment
+from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.production.image_production import Production, ProductionOptions, produce_points
 from amers.services.production.point_views import chips_of, point_views
 from amers.services.sensors.base import SensorModel

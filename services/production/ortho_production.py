@@ -16,7 +16,7 @@ from amers.services.imagery.source import Window, block_means
 from amers.services.matching.multi_image import chip_inside
 from amers.services.production.detail_points import detail_points, detail_saliency
 from amers.services.production.point_views import check_image_names, chips_of
-from amers.services.production.view_agreement import agreed_views
+from amers.services.production.view_agreement import AgreedViews, agreed_views
 from amers.services.terrain import Terrain
 from amers.services.types import (
     Array,
@@ -24,6 +24,7 @@ from amers.services.types import (
     ControlPoints,
     FloatImage,
     Frame,
+    IntArray,
     Progress,
     no_progress,
     part_of,
@@ -137,63 +138,35 @@ def produce_ortho_points(
             images.
     """
     _check_scenes(scenes)
-    scene, gsd_m = scenes[0], max(scene_gsd_m(scene) for scene in scenes)
-    fine_m = options.fine_gsd_m or float(f"{gsd_m:.2g}")
-    coarse_m = options.coarse_gsd_m or 4.0 * fine_m
-    if not 0.0 < fine_m < coarse_m:
-        raise InputError(
-            f"ground samplings of {fine_m:g} and {coarse_m:g} m given: fine_gsd_m must be above 0 and "
-            "below coarse_gsd_m"
-        )
+    scene, gsds_m = scenes[0], _gsds_m(scenes, options)
     squares = _squares(scene, scene_gsd_m(scene), options)
-    corners: list[_Corner] = []
     search = part_of(progress, 0.0, 0.9 if len(scenes) == 1 else 0.5)
-    for number, window in enumerate(squares):
-        if number % 16 == 0:
-            search(number / len(squares), f"searching {len(squares)} squares")
-        of_square = _salient_corners(scene, heights, window, fine_m, options)
-        # Other images may not show the best one.
-        corners += [_Corner(number, *c) for c in of_square[: 1 if len(scenes) == 1 else None]]
+    corners = _corners(scenes, heights, squares, gsds_m[0], options, progress=search)
     lon_lat_h = np.array([corner.lon_lat_h for corner in corners]).reshape(-1, 3)
-    agreed = agreed_views(scenes, lon_lat_h, fine_m, progress=part_of(progress, 0.5, 0.4))
-    for other, tied in zip(scenes, agreed.tied, strict=True):
-        if not tied:
-            raise InputError(
-                f"{other.acquisition.image_id}: shows fewer than 6 salient corners of "
-                f"{scene.acquisition.image_id}; expected images of one place: make a block of each"
-            )
-    confirmed = np.flatnonzero(agreed.confirmed(options.min_views))
-    first_of_square = np.unique([corners[row].square for row in confirmed], return_index=True)[1]
-    rows = confirmed[first_of_square]
+    agreed = agreed_views(scenes, lon_lat_h, gsds_m[0], progress=part_of(progress, 0.5, 0.4))
+    _check_one_place(scenes, agreed)
+    rows = _best_of_squares(corners, agreed, options)
     if len(rows) < _MIN_POINTS:
-        raise NotEnoughPoints(
-            len(rows),
-            _MIN_POINTS,
-            f"salient corners of known height in {len(squares)} squares of the image"
-            + (f", found in {options.min_views} images" if len(scenes) > 1 else ""),
-        )
+        found = f", found in {options.min_views} images" if len(scenes) > 1 else ""
+        what = f"salient corners of known height in {len(squares)} squares of the image{found}"
+        raise NotEnoughPoints(len(rows), _MIN_POINTS, what)
     progress(1.0, f"{len(rows)} points")
     sigma_m = max(scene_gsd_m(scene) * options.local_sigma_px, np.nan_to_num(agreed.local_sigma_m))
-    variance_m2 = np.array([sigma_m, sigma_m, heights.sigma_m]) ** 2
+    covariance_m2 = np.diag(np.array([sigma_m, sigma_m, heights.sigma_m]) ** 2)
     points = detail_points(
         agreed,
         rows,
         lon_lat_h[rows],
-        np.tile(np.diag(variance_m2), (len(rows), 1, 1)),
+        np.tile(covariance_m2, (len(rows), 1, 1)),
         saliency=np.array([corners[row].saliency for row in rows]),
         frame=Frame.from_sigmas(scene.sigma_m * agreed.disagreement, heights.frame_sigma_m),
-        gsds_m=(fine_m, coarse_m),
+        gsds_m=gsds_m,
     )
     vertical = np.zeros(len(points.views.gsd_m))
-    views = replace(points.views, incidence_deg=vertical, azimuth_deg=vertical)
-    return OrthoPoints(
-        points=replace(points, views=views),
-        chips=chips_of(agreed.scenes, points.lon_lat_h, points.views),
-        gsds_m=(fine_m, coarse_m),
-        outline=box_around(points.lon_lat_h),
-        shift_m=agreed.shift_m,
-        local_sigma_m=agreed.local_sigma_m,
-    )
+    points = replace(points, views=replace(points.views, incidence_deg=vertical, azimuth_deg=vertical))
+    chips = chips_of(agreed.scenes, points.lon_lat_h, points.views)
+    outline = box_around(points.lon_lat_h)
+    return OrthoPoints(points, chips, gsds_m, outline, agreed.shift_m, agreed.local_sigma_m)
 
 
 @dataclass(frozen=True)
@@ -203,6 +176,57 @@ class _Corner:
     square: int
     lon_lat_h: Array
     saliency: float
+
+
+def _gsds_m(scenes: Sequence[Scene], options: OrthoPointOptions) -> tuple[float, float]:
+    """Ground samplings of the chips: those of the options, or what suits the coarsest image."""
+    fine_m = options.fine_gsd_m or float(f"{max(scene_gsd_m(scene) for scene in scenes):.2g}")
+    coarse_m = options.coarse_gsd_m or 4.0 * fine_m
+    if not 0.0 < fine_m < coarse_m:
+        raise InputError(
+            f"ground samplings of {fine_m:g} and {coarse_m:g} m given: fine_gsd_m must be above 0 and "
+            "below coarse_gsd_m"
+        )
+    return fine_m, coarse_m
+
+
+def _corners(
+    scenes: Sequence[Scene],
+    heights: GroundHeights,
+    squares: list[Window],
+    fine_m: float,
+    options: OrthoPointOptions,
+    *,
+    progress: Progress,
+) -> list[_Corner]:
+    """The salient corners of the squares of the first image, square by square, the best first."""
+    corners: list[_Corner] = []
+    for number, window in enumerate(squares):
+        if number % 16 == 0:
+            progress(number / len(squares), f"searching {len(squares)} squares")
+        of_square = _salient_corners(scenes[0], heights, window, fine_m, options)
+        # Other images may not show the best one.
+        corners += [_Corner(number, *c) for c in of_square[: 1 if len(scenes) == 1 else None]]
+    return corners
+
+
+def _best_of_squares(
+    corners: list[_Corner], agreed: AgreedViews, options: OrthoPointOptions
+) -> IntArray:
+    """The first corner of every square that enough images confirm."""
+    confirmed = np.flatnonzero(agreed.confirmed(options.min_views))
+    squares = [corners[row].square for row in confirmed]
+    return np.asarray(confirmed[np.unique(squares, return_index=True)[1]])
+
+
+def _check_one_place(scenes: Sequence[Scene], agreed: AgreedViews) -> None:
+    """Refuse an image that shows too few of the corners."""
+    for other, tied in zip(scenes, agreed.tied, strict=True):
+        if not tied:
+            raise InputError(
+                f"{other.acquisition.image_id}: shows fewer than 6 salient corners of "
+                f"{scenes[0].acquisition.image_id}; expected images of one place: make a block of each"
+            )
 
 
 def _check_scenes(scenes: Sequence[Scene]) -> None:
@@ -237,7 +261,7 @@ def _salient_corners(
 ) -> list[tuple[Array, float]]:
     """The salient corners of a square, the best first: lon, lat, height (3,) and saliency."""
     factor = max(1, int(fine_m / scene_gsd_m(scene)))
-    corners = _corners(block_means(scene.image.read(square), factor), options.candidates)
+    corners = _strongest(block_means(scene.image.read(square), factor), options.candidates)
     line_sample = corners * factor + (factor - 1) / 2.0 + [square.line, square.sample]
     lon_lat = scene.model.locate(line_sample, np.zeros(len(corners)))[:, :2]
     lon_lat_h = np.column_stack([lon_lat, heights.at(lon_lat)])
@@ -248,7 +272,7 @@ def _salient_corners(
     return sorted(salient, key=lambda corner: -corner[1])
 
 
-def _corners(pixels: FloatImage, count: int) -> Array:
+def _strongest(pixels: FloatImage, count: int) -> Array:
     """The strongest corners (n, 2), row and column, away from areas without data and saturated ones."""
     if not np.isfinite(pixels).any() or min(pixels.shape) < 8:
         return np.empty((0, 2))

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from amers.services.errors import InputError, NotEnoughPoints
 from amers.services.geodesy import box_around
@@ -37,6 +38,8 @@ MISSING = "pixels of the chip are missing"
 NOT_SALIENT = "not salient"
 NOT_CONFIRMED = "not found in the other images"
 """Why a point is left out, in the order in which the points are judged."""
+Reasons = npt.NDArray[np.object_]
+"""(n,) of points; empty for those that are taken."""
 
 
 @dataclass(frozen=True)
@@ -117,44 +120,28 @@ def produce_known_points(
     """
     check_sigmas(ground)
     check_image_names(scenes)
-    fine_m, coarse_m = _gsds_m(scenes, options)
-    reason = np.full(len(ground), "", dtype=object)
-    reason[np.isnan(ground.lon_lat_h).any(axis=1)] = NO_HEIGHT
-    reason[repeated_places(ground.lon_lat_h) & (reason == "")] = SAME_PLACE
+    gsds_m = _gsds_m(scenes, options)
+    reason = reasons_of_places(ground, "")
     rows = np.flatnonzero(reason == "")
-    agreed = agreed_views(scenes, ground.lon_lat_h[rows], fine_m, progress=part_of(progress, 0.0, 0.7))
-    saliency = np.zeros(len(rows))
-    for number, (row, image) in enumerate(zip(rows, agreed.reference, strict=True)):
-        if number % 64 == 0:
-            progress(0.7 + 0.3 * number / len(rows), f"looking at {len(rows)} points")
-        if image >= 0:
-            saliency[number] = detail_saliency(agreed.scenes[image], ground.lon_lat_h[row], fine_m)
-    of_rows = np.full(len(rows), "", dtype=object)
-    of_rows[~agreed.confirmed(options.min_views)] = NOT_CONFIRMED
-    of_rows[saliency < options.min_saliency] = NOT_SALIENT
-    of_rows[agreed.reference < 0] = MISSING
-    of_rows[~_inside(scenes, ground.lon_lat_h[rows], fine_m)] = OUTSIDE
-    reason[rows] = of_rows
-    taken = np.flatnonzero(of_rows == "")
-    left_out = dict(Counter(reason[reason != ""].tolist()).most_common())
-    if len(taken) < MIN_POINTS:
-        counts = ", ".join(f"{count} {why}" for why, count in left_out.items())
-        raise NotEnoughPoints(len(taken), MIN_POINTS, f"of {len(ground)} points: {counts}")
-    lon_lat_h = ground.lon_lat_h[rows[taken]]
+    at = ground.lon_lat_h[rows]
+    agreed = agreed_views(scenes, at, gsds_m[0], progress=part_of(progress, 0.0, 0.7))
+    saliency = _saliency(agreed, at, gsds_m[0], part_of(progress, 0.7, 0.3))
+    reason[rows[~agreed.confirmed(options.min_views)]] = NOT_CONFIRMED
+    reason[rows[saliency < options.min_saliency]] = NOT_SALIENT
+    reason[rows[agreed.reference < 0]] = MISSING
+    reason[rows[~_inside(scenes, at, gsds_m[0])]] = OUTSIDE
+    left_out, taken = count_left_out(reason), np.flatnonzero(reason[rows] == "")
+    sigma_m = ground.sigma_m[rows[taken]]
+    covariance_m2 = _covariance_m2(sigma_m, at[taken], agreed, taken, options.local_sigma_px)
+    frame = _frame_with_image(frame, agreed)
     points = detail_points(
-        agreed,
-        taken,
-        lon_lat_h,
-        _covariance_m2(ground.sigma_m[rows[taken]], lon_lat_h, agreed, taken, options.local_sigma_px),
-        saliency=saliency[taken],
-        frame=_frame_with_image(frame, agreed),
-        gsds_m=(fine_m, coarse_m),
+        agreed, taken, at[taken], covariance_m2, saliency=saliency[taken], frame=frame, gsds_m=gsds_m
     )
     progress(1.0, f"{len(points)} points")
     return KnownPoints(
         points=points,
         chips=chips_of(agreed.scenes, points.lon_lat_h, points.views),
-        gsds_m=(fine_m, coarse_m),
+        gsds_m=gsds_m,
         outline=box_around(points.lon_lat_h),
         scenes=agreed.scenes,
         source_id=ground.id[rows[taken]],
@@ -162,6 +149,39 @@ def produce_known_points(
         shift_m=agreed.shift_m,
         local_sigma_m=agreed.local_sigma_m,
     )
+
+
+def _saliency(agreed: AgreedViews, lon_lat_h: Array, gsd_m: float, progress: Progress) -> Array:
+    """The saliency (n,) of points (n, 3) in the first image that shows each; 0 where none does."""
+    saliency = np.zeros(len(lon_lat_h))
+    for number, image in enumerate(agreed.reference):
+        if number % 64 == 0:
+            progress(number / len(lon_lat_h), f"looking at {len(lon_lat_h)} points")
+        if image >= 0:
+            saliency[number] = detail_saliency(agreed.scenes[image], lon_lat_h[number], gsd_m)
+    return saliency
+
+
+def reasons_of_places(ground: GroundPoints, otherwise: str) -> Reasons:
+    """Why points (n,) have no usable place; `otherwise` for those that have one."""
+    reason = np.full(len(ground), otherwise, dtype=object)
+    reason[_repeated_places(ground.lon_lat_h)] = SAME_PLACE
+    reason[np.isnan(ground.lon_lat_h).any(axis=1)] = NO_HEIGHT
+    return reason
+
+
+def count_left_out(reason: Reasons) -> dict[str, int]:
+    """The number of points left out by reason (n,), which is empty for those that are taken.
+
+    Raises:
+        NotEnoughPoints: fewer than `MIN_POINTS` are taken.
+    """
+    left_out = dict(Counter(reason[reason != ""].tolist()).most_common())
+    taken = int((reason == "").sum())
+    if taken < MIN_POINTS:
+        counts = ", ".join(f"{count} {why}" for why, count in left_out.items())
+        raise NotEnoughPoints(taken, MIN_POINTS, f"of {len(reason)} points: {counts}")
+    return left_out
 
 
 def check_sigmas(ground: GroundPoints) -> None:
@@ -196,7 +216,7 @@ def _inside(scenes: Sequence[Scene], lon_lat_h: Array, gsd_m: float) -> BoolArra
     return inside
 
 
-def repeated_places(lon_lat_h: Array) -> BoolArray:
+def _repeated_places(lon_lat_h: Array) -> BoolArray:
     """Which points (n, 3) have the place of an earlier one."""
     first = np.unique(lon_lat_h, axis=0, return_index=True)[1]
     repeated = np.ones(len(lon_lat_h), dtype=bool)

@@ -1,29 +1,27 @@
 """POINTS OF ANOTHER BASE WITH CHIPS OF THEIR OWN IN -> POINTS OF A BLOCK OUT, without any image."""
 
 import math
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from amers.services.conventions import CHIP_CENTRE
-from amers.services.errors import FormatError, NotEnoughPoints
+from amers.services.errors import FormatError
 from amers.services.geodesy import box_around
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import image_gsd_m, render_chip
 from amers.services.matching.multi_image import nearly_whole, stored_chip
 from amers.services.production.detail_points import detail_saliency
 from amers.services.production.points_production import (
-    MIN_POINTS,
     MISSING,
-    NO_HEIGHT,
     NOT_SALIENT,
-    SAME_PLACE,
     KnownPointOptions,
     KnownPoints,
+    Reasons,
     check_sigmas,
-    repeated_places,
+    count_left_out,
+    reasons_of_places,
 )
 from amers.services.types import (
     Acquisition,
@@ -83,9 +81,66 @@ def produce_points_with_chips(
         NotEnoughPoints: too few points have a chip; the message counts the others by their reason.
     """
     check_sigmas(ground)
-    reason = np.full(len(ground), NO_CHIP, dtype=object)
-    reason[repeated_places(ground.lon_lat_h)] = SAME_PLACE
-    reason[np.isnan(ground.lon_lat_h).any(axis=1)] = NO_HEIGHT
+    judged = _judged(ground, chips, progress)
+    good, gsd_m = judged.good, judged.gsd_m
+    taken, first, count = np.unique(judged.row[good], return_index=True, return_counts=True)
+    judged.reason[taken] = ""
+    left_out = count_left_out(judged.reason)
+    lon_lat_h = ground.lon_lat_h[taken]
+    points = ControlPoints(
+        id=np.arange(len(taken), dtype=np.int64),
+        lon_lat_h=lon_lat_h,
+        covariance_m2=ground.sigma_m[taken, :, None] ** 2 * np.eye(3),
+        block=np.zeros(len(taken), dtype=np.int64),
+        frames=(frame,),
+        saliency=np.maximum.reduceat(judged.saliency[good], first),
+        health=np.ones(len(taken)),
+        views=_views(chips, good, first, gsd_m),
+        chip_file=np.zeros(len(taken), dtype=np.int64),
+        chip_row=first.astype(np.int64),
+        chip_files=("chips",),
+    )
+
+    def cut(point: int) -> ChipArray:
+        of_point = good[first[point] : first[point] + count[point]]
+        return np.stack([_cut(chips, int(k), lon_lat_h[point], gsd_m) for k in of_point])
+
+    progress(1.0, f"{len(points)} points")
+    return KnownPoints(
+        points=points,
+        chips=cut,
+        gsds_m=(gsd_m,),
+        outline=box_around(lon_lat_h),
+        scenes=[],
+        source_id=ground.id[taken],
+        left_out=left_out,
+        shift_m=np.zeros((0, 2)),
+        local_sigma_m=math.nan,
+    )
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """The m chips and n points of a base, judged.
+
+    Attributes:
+        row: (m,) of the point of each chip; -1 for none.
+        gsd_m: ground sampling at which most chips are whole.
+        saliency: (m,) NaN for chips that are not used.
+        good: chips that are used, one of each image for a point; point by point.
+        reason: (n,) why a point has no chip, or what is wrong with one.
+    """
+
+    row: IntArray
+    gsd_m: float
+    saliency: Array
+    good: IntArray
+    reason: Reasons
+
+
+def _judged(ground: GroundPoints, chips: OwnChips, progress: Progress) -> _Judged:
+    """Every chip opened twice: for the ground sampling that suits most, and at that sampling."""
+    reason = reasons_of_places(ground, NO_CHIP)
     row_of = {name: row for row, name in enumerate(ground.id.tolist()) if reason[row] == NO_CHIP}
     row = np.array([row_of.get(name, -1) for name in chips.point_id.tolist()], dtype=np.int64)
     place = ground.lon_lat_h[row]
@@ -105,53 +160,21 @@ def produce_points_with_chips(
             saliency[k] = found
     good = np.flatnonzero(np.isfinite(saliency))
     good = good[np.unique([row[good], chips.image[good]], axis=1, return_index=True)[1]]
-    taken, first, count = np.unique(row[good], return_index=True, return_counts=True)
-    reason[taken] = ""
-    counted = dict(Counter(reason[reason != ""].tolist()).most_common())
-    if len(taken) < MIN_POINTS:
-        counts = ", ".join(f"{number} {why}" for why, number in counted.items())
-        raise NotEnoughPoints(len(taken), MIN_POINTS, f"of {len(ground)} points: {counts}")
-    lon_lat_h, start = ground.lon_lat_h[taken], np.append(first, len(good)).astype(np.int64)
+    return _Judged(row, gsd_m, saliency, good, reason)
+
+
+def _views(chips: OwnChips, good: IntArray, first: IntArray, gsd_m: float) -> Views:
+    """The views that chips `good` are, of points of which each begins at `first`."""
     used, image = np.unique(chips.image[good], return_inverse=True)
     vertical = np.zeros(len(good))
-    views = Views(
-        start=start,
+    return Views(
+        start=np.append(first, len(good)).astype(np.int64),
         gsd_m=np.full(len(good), gsd_m),
         image=image.astype(np.int64),
         incidence_deg=vertical,
         azimuth_deg=vertical,
         health=np.ones(len(good)),
         images=tuple(chips.images[i] for i in used),
-    )
-    points = ControlPoints(
-        id=np.arange(len(taken), dtype=np.int64),
-        lon_lat_h=lon_lat_h,
-        covariance_m2=ground.sigma_m[taken, :, None] ** 2 * np.eye(3),
-        block=np.zeros(len(taken), dtype=np.int64),
-        frames=(frame,),
-        saliency=np.maximum.reduceat(saliency[good], first),
-        health=np.ones(len(taken)),
-        views=views,
-        chip_file=np.zeros(len(taken), dtype=np.int64),
-        chip_row=start[:-1].copy(),
-        chip_files=("chips",),
-    )
-
-    def cut(point: int) -> ChipArray:
-        of_point = good[start[point] : start[point] + count[point]]
-        return np.stack([_cut(chips, int(k), lon_lat_h[point], gsd_m) for k in of_point])
-
-    progress(1.0, f"{len(points)} points")
-    return KnownPoints(
-        points=points,
-        chips=cut,
-        gsds_m=(gsd_m,),
-        outline=box_around(lon_lat_h),
-        scenes=[],
-        source_id=ground.id[taken],
-        left_out=counted,
-        shift_m=np.zeros((0, 2)),
-        local_sigma_m=math.nan,
     )
 
 

@@ -108,41 +108,31 @@ def agreed_views(
     search = _Search(list(scenes), reference, lon_lat_h)
     shift_m, tied = np.zeros((len(scenes), 2)), np.arange(len(scenes)) == 0
     pairs = [(int(row), int(image)) for row, image in enumerate(reference) if image >= 0]
-    variances_m2: list[tuple[int, float]] = []
+    measures, variance_sum_m2 = 0, 0.0
     for k in range(1, len(scenes)):
         progress(k / len(scenes), f"searching points in {scenes[k].acquisition.image_id}")
         rows = np.flatnonzero(whole[k] & (reference < k))
         if len(rows) < _MIN_COMMON:
             continue
-        first_m = search.first_shift(scenes[k], rows, gsd_m)
-        moved = _moved(scenes[k], lon_lat_h[rows], first_m)
-        found, off_m = search.displacements(moved, rows, gsd_m, _SEARCH.radius_px)
-        if len(found) < _MIN_COMMON:
-            raise _not_found(scenes[k], len(found), len(rows))
-        median_m = np.median(off_m, axis=0)
-        residual_m = off_m - median_m
-        sigma_m = max(_NORMAL_MAD * float(np.median(np.abs(residual_m))), _SEARCH.min_sigma_px * gsd_m)
-        agrees = np.linalg.norm(residual_m, axis=1) <= _MAX_DEVIATION * sigma_m
-        shift_m[k], tied[k] = first_m + median_m, True
+        shift_m[k], agreeing, sigma_m = search.agreement(scenes[k], rows, gsd_m)
+        tied[k] = True
         search.placed[k] = _moved(scenes[k], lon_lat_h[rows], shift_m[k])
-        pairs += [(int(row), k) for row in found[agrees]]
-        variances_m2.append((int(agrees.sum()), sigma_m**2 / 2.0))
-    placed = search.placed
+        pairs += [(int(row), k) for row in agreeing]
+        measures += len(agreeing)
+        variance_sum_m2 += len(agreeing) * (sigma_m**2 / 2.0)
     pairs.sort()
-    measures = sum(count for count, _ in variances_m2)
-    variance_m2 = sum(count * value for count, value in variances_m2) / max(measures, 1)
     point, image = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     line_sample = np.array(
-        [placed[i].model.project(lon_lat_h[p][None, :])[0] for p, i in pairs], dtype=np.float64
+        [search.placed[i].model.project(lon_lat_h[p][None, :])[0] for p, i in pairs], dtype=np.float64
     ).reshape(-1, 2)
     return AgreedViews(
-        scenes=placed,
+        scenes=search.placed,
         views=Observations(point, image, line_sample, np.full(len(point), np.nan)),
         reference=reference,
         shown_by=whole.sum(axis=0).astype(np.int64),
         shift_m=shift_m,
         tied=tied,
-        local_sigma_m=math.sqrt(variance_m2) if measures >= _MIN_MEASURES else math.nan,
+        local_sigma_m=math.sqrt(variance_sum_m2 / measures) if measures >= _MIN_MEASURES else math.nan,
     )
 
 
@@ -162,6 +152,23 @@ class _Search:
     placed: list[Scene]
     reference: IntArray
     lon_lat_h: Array
+
+    def agreement(self, scene: Scene, rows: IntArray, gsd_m: float) -> tuple[Array, IntArray, float]:
+        """Where a later image lies (2,), the rows that agree (m,), and their standard deviation.
+
+        The position is metres east and north of the earlier images; the standard deviation is that of
+        the displacements, a coordinate.
+        """
+        first_m = self.first_shift(scene, rows, gsd_m)
+        moved = _moved(scene, self.lon_lat_h[rows], first_m)
+        found, off_m = self.displacements(moved, rows, gsd_m, _SEARCH.radius_px)
+        if len(found) < _MIN_COMMON:
+            raise _not_found(scene, len(found), len(rows))
+        median_m = np.median(off_m, axis=0)
+        residual_m = off_m - median_m
+        sigma_m = max(_NORMAL_MAD * float(np.median(np.abs(residual_m))), _SEARCH.min_sigma_px * gsd_m)
+        agrees = np.linalg.norm(residual_m, axis=1) <= _MAX_DEVIATION * sigma_m
+        return first_m + median_m, found[agrees], sigma_m
 
     def first_shift(self, scene: Scene, rows: IntArray, gsd_m: float) -> Array:
         """Displacement (2,) east, north of an image within its stated accuracy, metres."""
