@@ -8,7 +8,7 @@ import numpy as np
 from amers.services.imagery.scene import Scene
 from amers.services.matching.control_points import PointMatches
 from amers.services.misfit.control_observations import ControlObservations
-from amers.services.misfit.image_correction import SceneAdjustment
+from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.quality.lack_of_fit import Elsewhere
 from amers.services.registration.context import SearchStage
 from amers.services.registration.options import RegistrationOptions

@@ -113,25 +113,18 @@ def register_together(
         InputError: two scenes have the same name.
         ComputationError: no scene shows control points that agree, or no scene fits.
     """
-    before = joined.scenes if joined else ()
+    before, known = (joined.scenes, joined.known) if joined else ((), None)
     scenes = [_on_known_ground(scene, points) for scene in scenes]
-    together = [*before, *scenes]
-    check_image_names(together)
+    check_image_names([*before, *scenes])
     work = work or Work()
     measured = [nothing_found(scene, points.take(np.zeros(0, dtype=np.int64))) for scene in before]
     searching = partial(measure_scene, points=points, chips=chips, options=options)
     measured += _measure_all(scenes, searching, work, part_of(progress, 0.0, 0.4))
     ties = _ties(measured, work, part_of(progress, 0.4, 0.3))
-    known = joined.known if joined else None
     progress(0.7, "adjusting the scenes together")
-    block, left = adjust_fitting(measured, ties, options, known)
-    again = _searched_again(block, points, chips, options, part_of(progress, 0.72, 0.08))
-    if again:
-        gone = {one.measured.name for one in left}
-        kept = [number for number, one in enumerate(measured) if one.name not in gone]
-        found = [again.get(measured[number].name, measured[number]) for number in kept]
-        block, others = adjust_fitting(found, ties_between(ties, kept), options, known)
-        left += others
+    again = part_of(progress, 0.72, 0.08)
+    search_again = partial(_searched_again, points=points, chips=chips, options=options, progress=again)
+    block, left = _fitted(measured, ties, options, known, search_again)
     names = {scene.acquisition.image_id for scene in before}
     numbers = tuple(k for k, one in enumerate(block.scenes) if one.name not in names)
     if not numbers:
@@ -140,6 +133,25 @@ def register_together(
     fits = tuple(scene_fit(block, number) for number in numbers)
     rigorous = tuple(rigorous_scene(block, number) for number in numbers)
     return JointRegistration(block, numbers, registrations, fits, rigorous, tuple(left))
+
+
+def _fitted(
+    measured: list[MeasuredScene],
+    ties: Observations,
+    options: RegistrationOptions,
+    known: KnownImages | None,
+    search_again: Callable[[JointBlock], dict[str, MeasuredScene]],
+) -> tuple[JointBlock, list[Left]]:
+    """The scenes that fit, searched again where the others expect their points, and those that left."""
+    block, left = adjust_fitting(measured, ties, options, known)
+    again = search_again(block)
+    if not again:
+        return block, left
+    gone = {one.measured.name for one in left}
+    kept = [number for number, one in enumerate(measured) if one.name not in gone]
+    found = [again.get(measured[number].name, measured[number]) for number in kept]
+    block, others = adjust_fitting(found, ties_between(ties, kept), options, known)
+    return block, [*left, *others]
 
 
 def _on_known_ground(scene: Scene, points: ControlPoints) -> Scene:

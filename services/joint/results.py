@@ -16,8 +16,9 @@ from amers.services.imagery.scene import scene_gsd_m
 from amers.services.joint.block import JointBlock
 from amers.services.joint.nearest import nearest_correction, scene_heights_m
 from amers.services.misfit.control_observations import declared_fit
-from amers.services.misfit.image_correction import SceneAdjustment, deformation_covariance
+from amers.services.misfit.image_correction import deformation_covariance
 from amers.services.misfit.placed_measures import PlacedMeasures
+from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.misfit.shared_errors import SharedErrors
 from amers.services.misfit.short_motion import STILL
 from amers.services.quality.cell_stability import cell_stability_of, cells_of
@@ -182,25 +183,7 @@ def registered_scene(
     measured = block.scenes[number]
     adjustment = _with_structures(block, number, scene_adjustment(block, number, options))
     measures = point_results(measured.scene, measured.points, measured.search, adjustment)
-    frame = shared_frame(measured.points, measures.active)
-    if not measures.active.any():
-        # Its neighbours hold it: in the frame of their points.
-        sources = block.control.source[block.adjustment.control_active]
-        shares = np.bincount(sources, minlength=len(measured.points.frames))
-        frame = weighted_frame(measured.points.frames, shares.astype(np.float64))
-    model = block.model(number)
-    scene = AdjustedScene(
-        model,
-        measures,
-        adjustment,
-        measured.scene.image.shape,
-        scene_gsd_m(measured.scene),
-        frame,
-        elsewhere=measured.elsewhere,
-        control_gsd_m=measured.search.chip_side_m / CHIP_SIZE,
-        breaks=measured.search.breaks,
-        shears=shears_of_active(measured.scene, measured.search, measures.active),
-    )
+    scene = _adjusted_scene(block, number, measures, adjustment)
 
     def of_scene(
         repetitions: Sequence[tuple[Sequence[IntArray], JointBlock | None]],
@@ -220,13 +203,38 @@ def registered_scene(
     )
     views = measured.search.matches.view_measures
     return Registration(
-        model,
+        scene.model,
         adjustment,
         measures,
         replace(views, point=measured.search.rows[views.point]),
         measured.stages,
-        frame,
+        scene.frame,
         qualification,
+    )
+
+
+def _adjusted_scene(
+    block: JointBlock, number: int, measures: Measures, adjustment: SceneAdjustment
+) -> AdjustedScene:
+    """A scene of a block as it is qualified."""
+    measured = block.scenes[number]
+    frame = shared_frame(measured.points, measures.active)
+    if not measures.active.any():
+        # Its neighbours hold it: in the frame of their points.
+        sources = block.control.source[block.adjustment.control_active]
+        shares = np.bincount(sources, minlength=len(measured.points.frames))
+        frame = weighted_frame(measured.points.frames, shares.astype(np.float64))
+    return AdjustedScene(
+        block.model(number),
+        measures,
+        adjustment,
+        measured.scene.image.shape,
+        scene_gsd_m(measured.scene),
+        frame,
+        elsewhere=measured.elsewhere,
+        control_gsd_m=measured.search.chip_side_m / CHIP_SIZE,
+        breaks=measured.search.breaks,
+        shears=shears_of_active(measured.scene, measured.search, measures.active),
     )
 
 

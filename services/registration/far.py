@@ -153,26 +153,10 @@ def search_far(
     plan = _plan(context, points, prediction, gsd_m)
     tried = points.take(plan.rows)
     context.progress(0.0, f"searching {len(tried)} points within {plan.error_m / 1000.0:.1f} km")
+    predicted = prediction.model.project(tried.lon_lat_h)
     scene_map = _render(scene, prediction.model, plan, tried)
     templates = _templates(context, tried, chips, plan)
-    predicted = prediction.model.project(tried.lon_lat_h)
-    for is_last in (False, True):
-        if is_last:
-            scene_map = replace(scene_map, pixels=gradient_image(scene_map.pixels))
-            templates = [gradient_image(chip) for chip in templates]
-        measured, reason = _find(context, scene_map, templates, predicted, plan)
-        consensus = first_consensus(
-            scene,
-            predicted,
-            measured,
-            level_m=plan.level_m,
-            radius_m=plan.radius_px * plan.level_m,
-            side_m=CHIP_SIZE * gsd_m,
-            cut_px=plan.cut_px,
-        )
-        # Two tries are two chances.
-        if 2.0 * consensus.false_alarms <= options.max_false_alarms:
-            break
+    measured, reason, consensus = _searched(context, scene_map, templates, predicted, plan)
     stage = _summary(scene, plan, consensus, reason)
     context.stages.append(stage)
     check_consensus(
@@ -190,6 +174,34 @@ def search_far(
         FIRST_TOLERANCE_PX * plan.level_m / 2.0,
     )
     return Prediction(CorrectedModel(scene.model, correction), uncertainty_m)
+
+
+def _searched(
+    context: RegistrationContext,
+    scene_map: _Map,
+    templates: list[FloatImage],
+    predicted: Array,
+    plan: _Plan,
+) -> tuple[Array, np.ndarray, Consensus]:
+    """Positions (n, 2) of chips, why there is none (n,), and on what they agree."""
+    for is_last in (False, True):
+        if is_last:
+            scene_map = replace(scene_map, pixels=gradient_image(scene_map.pixels))
+            templates = [gradient_image(chip) for chip in templates]
+        measured, reason = _find(context, scene_map, templates, predicted, plan)
+        consensus = first_consensus(
+            context.scene,
+            predicted,
+            measured,
+            level_m=plan.level_m,
+            radius_m=plan.radius_px * plan.level_m,
+            side_m=CHIP_SIZE * plan.gsd_m,
+            cut_px=plan.cut_px,
+        )
+        # Two tries are two chances.
+        if 2.0 * consensus.false_alarms <= context.options.coarse.max_false_alarms:
+            break
+    return measured, reason, consensus
 
 
 def _plan(
@@ -301,10 +313,8 @@ def _find(
         if unusable[places].all():
             continue
         patch = pixels[top : bottom + side - 1, left : right + side - 1]
-        scores = cv2.matchTemplate(patch, _standardised(chip), cv2.TM_CCORR) / contrast[places]
-        scores[unusable[places]] = -1.0
-        best = np.array(np.unravel_index(int(scores.argmax()), scores.shape)) + (top, left)
-        score = float(scores.max())
+        offset, score = _best(patch, chip, contrast[places], unusable[places])
+        best = offset + (top, left)
         if not context.options.coarse.min_score <= score <= 1.001:
             reason[i] = "low_score"
         elif (np.abs(best - wanted) >= plan.radius_px).any():
@@ -312,6 +322,15 @@ def _find(
         else:
             reason[i], found[i] = "", best + side // 2
     return scene_map.line_sample(found), reason
+
+
+def _best(
+    patch: FloatImage, chip: FloatImage, contrast: FloatImage, unusable: BoolArray
+) -> tuple[IntArray, float]:
+    """Row and column (2,) where a chip correlates best with a patch, and how well."""
+    scores = cv2.matchTemplate(patch, _standardised(chip), cv2.TM_CCORR) / contrast
+    scores[unusable] = -1.0
+    return np.array(np.unravel_index(int(scores.argmax()), scores.shape)), float(scores.max())
 
 
 def _contrast(pixels: FloatImage, side: int) -> FloatImage:
