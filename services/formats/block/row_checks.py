@@ -1,5 +1,7 @@
 """Checks of the rows of the two tables of an Amers block."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import shapely
 
@@ -162,12 +164,16 @@ def check_views(
         image_id,
         f"an image of amers:images in {BLOCK_JSON}",
     )
-    gsds = document.metadata.specification.gsds_m
+    _check_samplings(report, views, document.metadata.specification.gsds_m)
+    _check_chips(report, points, views)
+
+
+def _check_samplings(report: ProblemReport, views: ViewRows, gsds_m: Sequence[float]) -> None:
     report.rows(
         (VIEWS_PARQUET, "gsd_m"),
-        ~np.isclose(views.gsd_m[:, None], np.array(gsds)[None, :], rtol=1e-6, atol=0.0).any(axis=1),
+        ~np.isclose(views.gsd_m[:, None], np.array(gsds_m)[None, :], rtol=1e-6, atol=0.0).any(axis=1),
         views.gsd_m,
-        "one of " + ", ".join(f"{gsd:g}" for gsd in gsds),
+        "one of " + ", ".join(f"{gsd:g}" for gsd in gsds_m),
     )
     coarser = np.diff(views.gsd_m, prepend=-np.inf) < 0.0
     report.rows(
@@ -176,6 +182,9 @@ def check_views(
         views.gsd_m,
         "the finest first within each point",
     )
+
+
+def _check_chips(report: ProblemReport, points: PointRows, views: ViewRows) -> None:
     owner = np.repeat(np.arange(len(points.id)), points.chip_count)
     report.rows(
         (VIEWS_PARQUET, "chip_row"),

@@ -110,26 +110,9 @@ def write_cog(
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     tiled, complete = (path.with_name(f".{path.name}.{end}") for end in ("tiled", "complete"))
-    error_px = 0.0
-    profile = {
-        "driver": "GTiff",
-        "height": grid.shape[0],
-        "width": grid.shape[1],
-        "count": bands,
-        "dtype": dtype,
-        "crs": grid.crs,
-        "transform": gdal_transform(grid),
-        "nodata": nodata,
-    }
-    tiles = {"tiled": True, "blockxsize": 512, "blockysize": 512, "BIGTIFF": "IF_SAFER"}
     try:
         with as_format_error(path, "a writable file"), rasterio.Env(**GDAL_OPTIONS):
-            with rasterio.open(tiled, "w", **profile, **tiles) as file:
-                for ortho in windows:
-                    w = ortho.window
-                    target = RasterWindow(w.sample, w.line, w.samples, w.lines)
-                    file.write(_encoded(ortho.pixels, np.dtype(dtype), nodata, saturated), window=target)
-                    error_px = max(error_px, ortho.error_px)
+            error_px = _write_windows(tiled, windows, _profile(grid, bands, dtype, nodata), saturated)
             predictor = "FLOATING_POINT" if dtype == "float32" else "STANDARD"
             rasterio.shutil.copy(
                 tiled,
@@ -145,6 +128,39 @@ def write_cog(
     finally:
         tiled.unlink(missing_ok=True)
         complete.unlink(missing_ok=True)
+    return error_px
+
+
+def _profile(grid: MapGrid, bands: int, dtype: str, nodata: float) -> dict[str, Any]:
+    """How a GeoTIFF in tiles is created."""
+    return {
+        "driver": "GTiff",
+        "height": grid.shape[0],
+        "width": grid.shape[1],
+        "count": bands,
+        "dtype": dtype,
+        "crs": grid.crs,
+        "transform": gdal_transform(grid),
+        "nodata": nodata,
+        "tiled": True,
+        "blockxsize": 512,
+        "blockysize": 512,
+        "BIGTIFF": "IF_SAFER",
+    }
+
+
+def _write_windows(
+    path: Path, windows: Iterable[OrthoWindow], profile: dict[str, Any], saturated: int | None
+) -> float:
+    """Write the windows into a new file; returns their largest error."""
+    error_px = 0.0
+    with rasterio.open(path, "w", **profile) as file:
+        for ortho in windows:
+            w = ortho.window
+            target = RasterWindow(w.sample, w.line, w.samples, w.lines)
+            dtype, nodata = np.dtype(profile["dtype"]), profile["nodata"]
+            file.write(_encoded(ortho.pixels, dtype, nodata, saturated), window=target)
+            error_px = max(error_px, ortho.error_px)
     return error_px
 
 

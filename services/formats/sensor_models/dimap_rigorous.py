@@ -18,6 +18,7 @@ from amers.services.formats.sensor_models.xml_values import (
 from amers.services.sensors.attitude import interpolated_attitude
 from amers.services.sensors.piecewise import (
     LAGRANGE_NODES,
+    PiecewisePolynomial,
     extended,
     hermite,
     lagrange,
@@ -65,17 +66,7 @@ def parse_dimap_rigorous(text: str, source: str = "DIMAP") -> PushbroomModel:
     start = single(refined, "Time/Time_Range/START", source)
     midnight = midnight_before(start, source)
     start_s = seconds(start, midnight, source)
-    period = single(refined, "Time/Time_Stamp/LINE_PERIOD", source)
-    unit = period.get("unit", "").strip()
-    if unit not in _PERIOD_UNITS_S:
-        raise FormatError(
-            f"{source}: LINE_PERIOD: unit {unit[:20]!r} found, one of "
-            f"{', '.join(_PERIOD_UNITS_S)} expected"
-        )
-    period_s = _PERIOD_UNITS_S[unit] * number(
-        refined, "Time/Time_Stamp/LINE_PERIOD", source, (1e-9, 1e6)
-    )
-    line_time = polynomial(0.0, 1.0, np.array([[start_s, period_s]]))
+    line_time = polynomial(0.0, 1.0, np.array([[start_s, _line_period_s(refined, source)]]))
     used = used_times(line_time, shape[0])
 
     def times(entries: list[ElementTree.Element], name: str, needed: int) -> Array:
@@ -84,22 +75,10 @@ def parse_dimap_rigorous(text: str, source: str = "DIMAP") -> PushbroomModel:
         return check_increasing(np.array(found), name, needed, source)
 
     points = refined.findall("Ephemeris/Point_List/Point")
-    orbit_s = times(points, "Ephemeris", 2)
-    position, velocity = (
-        np.array([numbers(single(point, name, source), source, 3) for point in points])
-        for name in ("LOCATION_XYZ", "VELOCITY_XYZ")
-    )
-    if len(points) < LAGRANGE_NODES:
-        orbit = hermite(orbit_s, position, velocity)
-    else:
-        orbit = lagrange(orbit_s, position)
+    orbit = _orbit(points, times(points, "Ephemeris", 2), source)
     entries = refined.findall("Attitudes/Quaternion_List/Quaternion")
     attitude_s = times(entries, "Quaternion_List", LAGRANGE_NODES)
-    quaternions = np.array(
-        [[number(entry, f"Q{k}", source, (-1.1, 1.1)) for k in (1, 2, 3, 0)] for entry in entries]
-    )
-    if not (np.linalg.norm(quaternions, axis=1) > 0.5).all():
-        raise FormatError(f"{source}: Quaternion_List: a quaternion is not of unit length")
+    quaternions = _quaternions(entries, source)
     for name in ("YAW", "PITCH", "ROLL"):
         number(refined, f"Instrument_Biases/{name}", source, (0.0, 0.0))
     model = PushbroomModel(
@@ -111,6 +90,38 @@ def parse_dimap_rigorous(text: str, source: str = "DIMAP") -> PushbroomModel:
         height_range_m=TERRAIN_M,
     )
     return check_pushbroom(model, source)
+
+
+def _line_period_s(refined: ElementTree.Element, source: str) -> float:
+    name = "Time/Time_Stamp/LINE_PERIOD"
+    unit = single(refined, name, source).get("unit", "").strip()
+    if unit not in _PERIOD_UNITS_S:
+        raise FormatError(
+            f"{source}: LINE_PERIOD: unit {unit[:20]!r} found, one of "
+            f"{', '.join(_PERIOD_UNITS_S)} expected"
+        )
+    return _PERIOD_UNITS_S[unit] * number(refined, name, source, (1e-9, 1e6))
+
+
+def _orbit(points: list[ElementTree.Element], orbit_s: Array, source: str) -> PiecewisePolynomial:
+    """Positions by times (n,): by polynomials where there are enough points."""
+    position, velocity = (
+        np.array([numbers(single(point, name, source), source, 3) for point in points])
+        for name in ("LOCATION_XYZ", "VELOCITY_XYZ")
+    )
+    if len(points) < LAGRANGE_NODES:
+        return hermite(orbit_s, position, velocity)
+    return lagrange(orbit_s, position)
+
+
+def _quaternions(entries: list[ElementTree.Element], source: str) -> Array:
+    """(n, 4), the scalar last."""
+    quaternions = np.array(
+        [[number(entry, f"Q{k}", source, (-1.1, 1.1)) for k in (1, 2, 3, 0)] for entry in entries]
+    )
+    if not (np.linalg.norm(quaternions, axis=1) > 0.5).all():
+        raise FormatError(f"{source}: Quaternion_List: a quaternion is not of unit length")
+    return quaternions
 
 
 def _look(refined: ElementTree.Element, source: str) -> Array:

@@ -15,7 +15,7 @@ from amers.services.formats.sensor_models.rpc_files import (
     write_model,
 )
 from amers.services.map_grid import MapGrid
-from amers.services.misfit.image_correction import SceneAdjustment
+from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.sensors.base import SensorModel
 from amers.services.sensors.correction import CorrectedModel
 from amers.services.sensors.moving_pushbroom import AttitudeMotion
@@ -107,22 +107,7 @@ def write_refined(
     copied = image_path if copy_image and _is_geotiff(image_path) else None
     if copied is not None and (folder / copied.name).resolve() != copied.resolve():
         (folder / copied.name).unlink(missing_ok=True)
-    base = model.base if isinstance(model, CorrectedModel) else None
-    if isinstance(model, AdjustedRigorous):
-        delivered = _delivered_rpc(image_path, model_path)
-        model_files = _write_fitted(delivered, model, shape, folder, copied)
-        applies_to = (
-            f"rigorous model of {image_path.name}: the nearest correction to the adjusted one, "
-            f"{model.correction_error_px:.2g} px off it at most"
-        )
-    elif isinstance(model, CorrectedModel) and isinstance(base, OrthoModel):
-        grid = fold_into_ortho(base, model.correction).grid
-        model_files = _write_grid(image_path, grid, folder, copied is not None)
-        applies_to = f"map grid of {image_path.name}"
-    else:
-        delivered = read_rpc(image_path, model_path) if isinstance(base, RpcModel) else None
-        model_files = _write_rpc(delivered, model, shape, folder, copied)
-        applies_to = delivered.note if delivered else f"model of {image_path.name}"
+    model_files, applies_to = _write_model(image_path, model_path, model, shape, folder, copied=copied)
     text = format_correction(
         adjustment.correction,
         adjustment.order,
@@ -139,6 +124,35 @@ def write_refined(
         files.append(folder / ATTITUDE_CSV)
         files[-1].write_text(format_attitude(model.attitude), encoding="utf-8")
     return RefinedFiles(tuple(files), model_files.max_error_px, model_files.note)
+
+
+def _write_model(
+    image_path: Path,
+    model_path: Path | None,
+    model: SensorModel | AdjustedRigorous,
+    shape: tuple[int, int],
+    folder: Path,
+    *,
+    copied: Path | None,
+) -> tuple[RefinedFiles, str]:
+    """The files of a refined model, and what a correction beside them applies to."""
+    base = model.base if isinstance(model, CorrectedModel) else None
+    if isinstance(model, AdjustedRigorous):
+        delivered = _delivered_rpc(image_path, model_path)
+        model_files = _write_fitted(delivered, model, shape, folder, copied)
+        applies_to = (
+            f"rigorous model of {image_path.name}: the nearest correction to the adjusted one, "
+            f"{model.correction_error_px:.2g} px off it at most"
+        )
+    elif isinstance(model, CorrectedModel) and isinstance(base, OrthoModel):
+        grid = fold_into_ortho(base, model.correction).grid
+        model_files = _write_grid(image_path, grid, folder, copied is not None)
+        applies_to = f"map grid of {image_path.name}"
+    else:
+        delivered = read_rpc(image_path, model_path) if isinstance(base, RpcModel) else None
+        model_files = _write_rpc(delivered, model, shape, folder, copied)
+        applies_to = delivered.note if delivered else f"model of {image_path.name}"
+    return model_files, applies_to
 
 
 def _write_rpc(

@@ -1,5 +1,6 @@
 """WorldView ISD: the rigorous model of basic (1B) products of WorldView satellites."""
 
+from datetime import datetime
 from xml.etree import ElementTree
 
 import numpy as np
@@ -60,29 +61,15 @@ def parse_worldview_isd(
     lines = np.array([numbers(entry, source, 2) for entry in image.iter("TLCLIST")])
     check_increasing(lines[:, 0] if len(lines) else np.empty(0), "lines of TLCLIST", 2, source)
 
-    def table(part: str, entry: str, first: int, last: int) -> tuple[Array, Array]:
-        """Times and columns of the table of a part of the document, evenly spaced in time."""
-        parent = single(root, part, source)
-        rows = [numbers(row, source) for row in parent.iter(entry)]
-        count = whole_number(parent, "NUMPOINTS", source, (8, 1_000_000))
-        if len(rows) != count or any(len(row) < last for row in rows):
-            raise FormatError(
-                f"{source}: {part}: {len(rows)} {entry} found, "
-                f"{count} of at least {last} numbers expected"
-            )
-        first_s = seconds(single(parent, "STARTTIME", source), midnight, source)
-        step_s = number(parent, "TIMEINTERVAL", source, (1e-6, 1e3))
-        values = np.array([row[first:last] for row in rows], dtype=np.float64)
-        return first_s + step_s * np.arange(count, dtype=np.float64), values
-
-    orbit_s, position = table("EPH", "EPHEMLIST", 1, 4)
-    attitude_s, quaternions = table("ATT", "ATTLIST", 1, 5)
+    orbit, attitude = (single(root, part, source) for part in ("EPH", "ATT"))
+    orbit_s, position = _table(orbit, "EPHEMLIST", slice(1, 4), midnight, source)
+    attitude_s, quaternions = _table(attitude, "ATTLIST", slice(1, 5), midnight, source)
     if not (np.linalg.norm(quaternions, axis=1) > 0.5).all():
         raise FormatError(f"{source}: ATTLIST: a quaternion is not of unit length")
     geometry = single(root, "GEO", source)
-    attitude = interpolated_attitude(attitude_s, quaternions)
+    turned = Rotation.from_quat(interpolated_attitude(attitude_s, quaternions)(orbit_s))
     centre = [number(geometry, f"PERSPECTIVE_CENTER/{key}", source) for key in ("CX", "CY", "CZ")]
-    position = position + Rotation.from_quat(attitude(orbit_s)).apply(centre)
+    position = position + turned.apply(centre)
     camera = [number(geometry, f"CAMERA_ATTITUDE/QCS{k}", source, (-1.0, 1.0)) for k in (1, 2, 3, 4)]
     quaternions = (Rotation.from_quat(quaternions) * Rotation.from_quat(camera)).as_quat()
     tlc_s = seconds(start, midnight, source)
@@ -98,6 +85,24 @@ def parse_worldview_isd(
         light_path=light_path,
     )
     return check_pushbroom(model, source)
+
+
+def _table(
+    parent: ElementTree.Element, entry: str, columns: slice, midnight: datetime, source: str
+) -> tuple[Array, Array]:
+    """Times and columns of the table of a part of the document, evenly spaced in time."""
+    last = columns.stop
+    rows = [numbers(row, source) for row in parent.iter(entry)]
+    count = whole_number(parent, "NUMPOINTS", source, (8, 1_000_000))
+    if len(rows) != count or any(len(row) < last for row in rows):
+        raise FormatError(
+            f"{source}: {parent.tag}: {len(rows)} {entry} found, "
+            f"{count} of at least {last} numbers expected"
+        )
+    first_s = seconds(single(parent, "STARTTIME", source), midnight, source)
+    step_s = number(parent, "TIMEINTERVAL", source, (1e-6, 1e3))
+    values = np.array([row[columns] for row in rows], dtype=np.float64)
+    return first_s + step_s * np.arange(count, dtype=np.float64), values
 
 
 def _look(geometry: ElementTree.Element, source: str) -> Array:
