@@ -70,19 +70,14 @@ def pushbroom_over(
     heading /= np.linalg.norm(heading)
     line_period_s = gsd_m / float(ground_speed)
 
-    half_s = VALIDITY * shape[0] / 2.0 * line_period_s
-    step_s = max(_STEP_S, half_s / 400.0)
-    steps = math.ceil(half_s / step_s) + _MARGIN_STEPS
-    times = step_s * np.arange(-steps, steps + 1, dtype=np.float64)
+    times = _times(VALIDITY * shape[0] / 2.0 * line_period_s)
     position = track.position(times)
     viewed = target + times[:, None] * ground_speed * heading
     viewed = _at_height(viewed, float(target_lon_lat_h[2]))
     attitude = _steering(position, viewed, heading)
     distance = float(np.linalg.norm(target - satellite))
     if jitter_px:
-        phase = rng.uniform(0.0, 2.0 * np.pi, 3) if rng else np.zeros(3)
-        angles = np.sin(2.0 * np.pi * JITTER_HZ * times[:, None] + phase)
-        attitude = attitude * Rotation.from_rotvec(jitter_px * gsd_m / distance * angles)
+        attitude = attitude * _oscillation(times, jitter_px * gsd_m / distance, rng)
     across = np.cross(heading, ground_axes[:, 2])
     sight = (target - satellite) / distance
     across_per_px = gsd_m * float(np.linalg.norm(across - (across @ sight) * sight)) / distance
@@ -94,6 +89,20 @@ def pushbroom_over(
         look=polynomial((shape[1] - 1.0) / 2.0, 1.0, np.array([[0.0, 0.0], [0.0, -across_per_px]])),
         height_range_m=height_range_m,
     )
+
+
+def _times(half_s: float) -> Array:
+    """Evenly spaced times (n,) around 0 that reach a little farther than half the time of an image."""
+    step_s = max(_STEP_S, half_s / 400.0)
+    steps = math.ceil(half_s / step_s) + _MARGIN_STEPS
+    return step_s * np.arange(-steps, steps + 1, dtype=np.float64)
+
+
+def _oscillation(times: Array, amplitude: float, rng: np.random.Generator | None) -> Rotation:
+    """Rotations at times (n,) that oscillate about each axis, radians."""
+    phase = rng.uniform(0.0, 2.0 * np.pi, 3) if rng else np.zeros(3)
+    angles = np.sin(2.0 * np.pi * JITTER_HZ * times[:, None] + phase)
+    return Rotation.from_rotvec(amplitude * angles)
 
 
 def sun_direction(lon_lat: Array, when: datetime) -> tuple[float, float]:

@@ -200,6 +200,18 @@ def intersect_surface(
 
 
 @njit(cache=True)
+def _ray_between(low: Array, high: Array, at: float, h_low: float, per_h: float) -> Ray:
+    """The line of sight at a fraction of the nodes (n, 2) of a line, low and high; `per_h` per metre."""
+    node = int(at)
+    f = at - node
+    xl = low[node, 0] + f * (low[node + 1, 0] - low[node, 0])
+    yl = low[node, 1] + f * (low[node + 1, 1] - low[node, 1])
+    gx = (high[node, 0] + f * (high[node + 1, 0] - high[node, 0]) - xl) * per_h
+    gy = (high[node, 1] + f * (high[node + 1, 1] - high[node, 1]) - yl) * per_h
+    return Ray(xl - h_low * gx, yl - h_low * gy, gx, gy)
+
+
+@njit(cache=True)
 def render_lines(
     surface: LitSurface, nodes: RayNodes, spacing: int, clearance: float, out: FloatImage
 ) -> None:
@@ -227,16 +239,10 @@ def render_lines(
                 version, at = 1, s + 0.5
                 if rays == 4:
                     version, at = 2 * (k // 2), s + 0.25 + 0.5 * (k % 2)
-                node = int(at) // spacing
-                f = at / spacing - node
-                low, high = nodes_low[version, r, node], nodes_high[version, r, node]
-                low1, high1 = nodes_low[version, r, node + 1], nodes_high[version, r, node + 1]
-                xl = low[0] + f * (low1[0] - low[0])
-                yl = low[1] + f * (low1[1] - low[1])
-                gx = (high[0] + f * (high1[0] - high[0]) - xl) * per_h
-                gy = (high[1] + f * (high1[1] - high[1]) - yl) * per_h
-                x0, y0 = xl - h_low * gx, yl - h_low * gy
-                ray = Ray(x0, y0, gx, gy)
+                ray = _ray_between(
+                    nodes_low[version, r], nodes_high[version, r], at / spacing, h_low, per_h
+                )
+                x0, y0, gx, gy = ray
                 h = intersect_ground(terrain, ray, h)
                 x, y = x0 + h * gx, y0 + h * gy
                 block_x = (math.floor(x) % columns) // 16
