@@ -1,7 +1,7 @@
 """Orthorectify a scene through its model and a terrain: for the command line, and as a process."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -213,10 +213,7 @@ def run_orthorectification(
         InputError: the scene or the terrain cannot be used.
         ComputationError: the mapping exceeds the tolerance.
     """
-    if ortho_map.gsd_m is not None and not ortho_map.gsd_m > 0.0:
-        raise InputError(f"gsd_m: {ortho_map.gsd_m:g} found, a length above 0 m expected")
-    if output.resolve() in (image.resolve(), terrain.dem.resolve()):
-        raise InputError(f"{output}: the output would replace an input file; choose another name")
+    _check_request(ortho_map, output, (image, terrain.dem))
     scene = read_scene(image, model, sigma_m=1.0)
     raster = scene.image
     assert isinstance(raster, RasterImage)
@@ -245,6 +242,14 @@ def run_orthorectification(
         error_px=error_px,
         vertical=ground.vertical,
     )
+
+
+def _check_request(ortho_map: OrthoMap, output: Path, inputs: Sequence[Path]) -> None:
+    """Refuse a ground sampling that is none, and an output that would replace an input."""
+    if ortho_map.gsd_m is not None and not ortho_map.gsd_m > 0.0:
+        raise InputError(f"gsd_m: {ortho_map.gsd_m:g} found, a length above 0 m expected")
+    if output.resolve() in [path.resolve() for path in inputs]:
+        raise InputError(f"{output}: the output would replace an input file; choose another name")
 
 
 def _pixel_type(raster: RasterImage) -> tuple[str, float]:

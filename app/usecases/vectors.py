@@ -20,25 +20,30 @@ from amers.app.usecases.vector_files import (
     refuse_overwriting,
     write_vertices,
 )
-from amers.services.formats.vector.layers import read_layer, write_layer
+from amers.services.formats.vector.layers import VectorLayer, read_layer, write_layer
 from amers.services.formats.vector.pixel_coordinates import (
     PixelOrigin,
     check_inside,
     line_sample_of_xy,
     xy_of_line_sample,
 )
+from amers.services.imagery.scene import Scene
 from amers.services.map_grid import check_map, check_map_code
 from amers.services.quality.accuracy_statement import StatedAccuracy, vertices_accuracy
+from amers.services.quality.correction_accuracy import CorrectionAccuracy
+from amers.services.terrain import Terrain
+from amers.services.types import IntArray
 from amers.services.vectors.accuracy import ErrorSources
-from amers.services.vectors.correct import correct_vectors, has_heights, missed_place
+from amers.services.vectors.correct import CorrectedVectors, correct_vectors, has_heights, missed_place
 from amers.services.vectors.project import (
+    ProjectedVectors,
     cut,
     ground_outline,
     hidden_share,
     image_outline,
     project_vectors,
 )
-from amers.services.vectors.shapes import geometries_of, shapes_of
+from amers.services.vectors.shapes import Geometries, Shapes, geometries_of, shapes_of
 
 RELATIVE_CE90, ON_THE_EARTH_CE90, HIDDEN = "ce90_m", "ce90_earth", "hidden"
 """Attributes that features get: the largest CE90 of their vertices, metres; share of hidden vertices."""
@@ -147,58 +152,78 @@ def correct_file(
     scene, registration = read_raw_scene(scene_model)
     ground = read_terrain(terrain)
     layer = read_layer(vectors.path, vectors.layer)
-    shapes = shapes_of(shapely.force_2d(layer.geometries))
-    refuse_longitudes(shapes.vertices, scene)
-    check_inside(shapes.vertices, scene.image.shape, options.pixels, options.margin_px)
-    height_sigma_m = options.height_sigma_m
-    if height_sigma_m is None:
-        height_sigma_m = HEIGHT_SIGMA_POSTINGS * ground.posting_m
-    model_sigma_m = float("nan") if scene_model.sigma_m is None else scene_model.sigma_m
+    shapes = _in_image(layer, scene, options)
+    sources = _error_sources(scene_model, registration, ground, options)
     crs = crs or default_crs(output, scene)
     corrected = correct_vectors(
-        shapes.with_vertices(line_sample_of_xy(shapes.vertices, options.pixels)),
-        scene,
-        ground,
-        crs,
-        sources=ErrorSources(registration, model_sigma_m, height_sigma_m, options.sigma_px),
-        tolerance_px=options.tolerance_px,
+        shapes, scene, ground, crs, sources=sources, tolerance_px=options.tolerance_px
     )
     refuse_missed(corrected.missed, missed_place(corrected), options)
-    relative_m = corrected.accuracy.relative_ce90_m
-    earth_m = corrected.accuracy.on_the_earth_ce90_m
-    out = corrected.shapes
-    columns = {RELATIVE_CE90: out.largest(relative_m), ON_THE_EARTH_CE90: out.largest(earth_m)}
-    is_kept = ~corrected.missed
-    is_kept[list(layer.unusable)] = False
-    kept = np.flatnonzero(is_kept)
-    geometries = geometries_of(out)
-    renamed = write_layer(output, layer.changed(geometries, columns, crs).take(kept))
-    entries = np.flatnonzero(~corrected.missed[out.geometry_of])
-    used = out.index[entries]
-    if vertices is not None:
-        table = {
-            "line": corrected.line_sample[used, 0],
-            "sample": corrected.line_sample[used, 1],
-            RELATIVE_CE90: relative_m[used],
-            ON_THE_EARTH_CE90: earth_m[used],
-        }
-        write_vertices(vertices, out, entries, table, crs)
-    frame = None if registration is None else registration.frame
-    stated = vertices_accuracy(relative_m[used], earth_m[used], frame)
+    features, renamed = _write_corrected(corrected, layer, crs, output, vertices)
+    used = corrected.shapes.index[_entries(corrected)]
+    accuracy, frame = corrected.accuracy, None if registration is None else registration.frame
+    stated = vertices_accuracy(accuracy.relative_ce90_m[used], accuracy.on_the_earth_ce90_m[used], frame)
     return CorrectedFile(
         output,
         crs,
         "metres above the ellipsoid" if has_heights(crs) else ground.vertical,
-        len(kept),
+        features,
         len(used),
         corrected.added,
         tuple((np.flatnonzero(corrected.missed) + 1).tolist()),
-        height_sigma_m,
+        sources.height_sigma_m,
         stated.relative_to_control_points,
         stated.on_the_earth,
         by_number(layer.unusable),
         renamed,
     )
+
+
+def _in_image(layer: VectorLayer, scene: Scene, options: CorrectionOptions) -> Shapes:
+    """The geometries of a layer in lines and samples of a scene, all of them inside its image."""
+    shapes = shapes_of(shapely.force_2d(layer.geometries))
+    refuse_longitudes(shapes.vertices, scene)
+    check_inside(shapes.vertices, scene.image.shape, options.pixels, options.margin_px)
+    return shapes.with_vertices(line_sample_of_xy(shapes.vertices, options.pixels))
+
+
+def _error_sources(
+    scene_model: SceneModel,
+    registration: CorrectionAccuracy | None,
+    ground: Terrain,
+    options: CorrectionOptions,
+) -> ErrorSources:
+    """What is stated, or else taken to be, of the errors of model, terrain and vertices."""
+    height_sigma_m = options.height_sigma_m
+    if height_sigma_m is None:
+        height_sigma_m = HEIGHT_SIGMA_POSTINGS * ground.posting_m
+    model_sigma_m = float("nan") if scene_model.sigma_m is None else scene_model.sigma_m
+    return ErrorSources(registration, model_sigma_m, height_sigma_m, options.sigma_px)
+
+
+def _entries(corrected: CorrectedVectors) -> IntArray:
+    """Entries of the vertices of features that were not missed."""
+    return np.flatnonzero(~corrected.missed[corrected.shapes.geometry_of])
+
+
+def _write_corrected(
+    corrected: CorrectedVectors, layer: VectorLayer, crs: str, output: Path, vertices: Path | None
+) -> tuple[int, dict[str, str]]:
+    """Write corrected features, and their vertices; returns the number of features, renamed columns."""
+    out, accuracy = corrected.shapes, corrected.accuracy
+    ce90_m = {RELATIVE_CE90: accuracy.relative_ce90_m, ON_THE_EARTH_CE90: accuracy.on_the_earth_ce90_m}
+    columns = {name: out.largest(values) for name, values in ce90_m.items()}
+    is_kept = ~corrected.missed
+    is_kept[list(layer.unusable)] = False
+    kept = np.flatnonzero(is_kept)
+    renamed = write_layer(output, layer.changed(geometries_of(out), columns, crs).take(kept))
+    if vertices is not None:
+        entries = _entries(corrected)
+        used = out.index[entries]
+        places = {name: corrected.line_sample[used, k] for k, name in enumerate(("line", "sample"))}
+        table = places | {name: values[used] for name, values in ce90_m.items()}
+        write_vertices(vertices, out, entries, table, crs)
+    return len(kept), renamed
 
 
 def project_file(
@@ -228,48 +253,25 @@ def project_file(
     scene, _ = read_raw_scene(scene_model)
     ground = read_terrain(terrain)
     layer = read_layer(vectors.path, vectors.layer)
-    if layer.crs is None:
-        raise InputError(
-            f"{vectors.path}: no known coordinate reference system found, one of a map expected"
-        )
-    try:
-        check_map(layer.crs)
-    except InputError as error:
-        raise InputError(f"{vectors.path}: {error}") from None
-    near = ground_outline(scene, ground, layer.crs)
-    geometries = layer.geometries.copy()
-    geometries[~shapely.intersects(geometries, near)] = None
-    if options.clip:
-        geometries = cut(geometries, near)
-    projected = project_vectors(
-        shapes_of(geometries), scene, ground, layer.crs, tolerance_px=options.tolerance_px
-    )
-    border = image_outline(scene.image.shape)
-    missed = projected.missed
-    in_image = geometries_of(projected.shapes)
+    crs = _map_of(vectors, layer)
+    near = _near(layer, ground_outline(scene, ground, crs), clip=options.clip)
+    projected = project_vectors(shapes_of(near), scene, ground, crs, tolerance_px=options.tolerance_px)
+    in_image, missed = geometries_of(projected.shapes), projected.missed
     in_image[missed] = None
-    shown = shapely.intersects(in_image, border)
-    place = f"feature {int(np.argmax(missed)) + 1}" if missed.any() else ""
-    refuse_missed(missed, place, options)
+    border = image_outline(scene.image.shape)
+    rows = np.flatnonzero(shapely.intersects(in_image, border))
+    refuse_missed(missed, f"feature {int(np.argmax(missed)) + 1}" if missed.any() else "", options)
     if options.clip:
         in_image = cut(in_image, border)
     shapes = shapes_of(in_image)
-    drawn = geometries_of(
-        shapes.with_vertices(xy_of_line_sample(shapes.vertices[:, :2], options.pixels))
-    )
-    rows = np.flatnonzero(shown)
-    renamed = write_layer(
-        output, layer.changed(drawn, {HIDDEN: hidden_share(projected)}, None).take(rows)
-    )
-    kept = np.isin(projected.shapes.geometry_of, rows)
-    entries = np.flatnonzero(kept)
+    xy = xy_of_line_sample(shapes.vertices[:, :2], options.pixels)
+    drawn = geometries_of(shapes.with_vertices(xy))
+    shown = layer.changed(drawn, {HIDDEN: hidden_share(projected)}, None).take(rows)
+    renamed = write_layer(output, shown)
+    entries = np.flatnonzero(np.isin(projected.shapes.geometry_of, rows))
     used = projected.shapes.index[entries]
     if vertices is not None:
-        lon_lat_h = projected.lon_lat_h[used]
-        table = {"lon": lon_lat_h[:, 0], "lat": lon_lat_h[:, 1], "height_m": lon_lat_h[:, 2]}
-        xy = xy_of_line_sample(projected.shapes.vertices, options.pixels)
-        in_pixels = projected.shapes.with_vertices(xy)
-        write_vertices(vertices, in_pixels, entries, table | {HIDDEN: projected.hidden[used]}, None)
+        _write_projected_vertices(vertices, projected, entries, options)
     return ProjectedFile(
         output,
         options.pixels,
@@ -282,6 +284,38 @@ def project_file(
         by_number(layer.unusable),
         renamed,
     )
+
+
+def _near(layer: VectorLayer, outline: shapely.Polygon, *, clip: bool) -> Geometries:
+    """The geometries that meet an outline, cut along it where they are to be; None for the others."""
+    geometries = layer.geometries.copy()
+    geometries[~shapely.intersects(geometries, outline)] = None
+    return cut(geometries, outline) if clip else geometries
+
+
+def _map_of(vectors: VectorFile, layer: VectorLayer) -> str:
+    """The reference system of vectors, which has to be one of a map."""
+    if layer.crs is None:
+        raise InputError(
+            f"{vectors.path}: no known coordinate reference system found, one of a map expected"
+        )
+    try:
+        check_map(layer.crs)
+    except InputError as error:
+        raise InputError(f"{vectors.path}: {error}") from None
+    return layer.crs
+
+
+def _write_projected_vertices(
+    path: Path, projected: ProjectedVectors, entries: IntArray, options: ProjectionOptions
+) -> None:
+    """Write every vertex in pixel coordinates, with its ground position and whether it is hidden."""
+    used = projected.shapes.index[entries]
+    lon_lat_h = projected.lon_lat_h[used]
+    table = {"lon": lon_lat_h[:, 0], "lat": lon_lat_h[:, 1], "height_m": lon_lat_h[:, 2]}
+    xy = xy_of_line_sample(projected.shapes.vertices, options.pixels)
+    in_pixels = projected.shapes.with_vertices(xy)
+    write_vertices(path, in_pixels, entries, table | {HIDDEN: projected.hidden[used]}, None)
 
 
 def by_number(rows: dict[int, str]) -> dict[int, str]:
