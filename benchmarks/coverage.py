@@ -30,7 +30,8 @@ from scipy.stats import binom
 
 from amers.services.errors import ComputationError
 from amers.services.misfit.control_observations import ControlObservations
-from amers.services.misfit.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
+from amers.services.misfit.image_correction import adjust_scene
+from amers.services.misfit.scene_adjustment import AdjustmentOptions, SceneAdjustment
 from amers.services.quality.normal_law import normal_ce90
 from amers.services.quality.stability import image_places
 from amers.services.sensors.correction import ImageCorrection, no_correction

@@ -113,57 +113,139 @@ def solve_displacement(
         shape: lines and samples of the image, which the nodes cover.
     """
     line, sample = _nodes(components, residuals, shape)
+    places = _places(components, residuals, line, sample, shape)
+    full = with_components(residuals, components)
+    both = [_coordinate(k, full, components, expected[k], places) for k in range(2)]
+    breaks = np.array([one.at_px + one.length_px / 2.0 for one in components if one.kind == "break"])
+    displacement = np.stack([one.displacement for one in both], -1)
+    variance = np.stack([one.variance for one in both], -1)
+    return ProfileSolution(
+        np.array([one.parameters for one in both]),
+        np.array([one.covariance for one in both]),
+        DisplacementGrid(line, sample, displacement, variance, breaks),
+    )
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Where a displacement is computed: at its nodes, and at e places evenly over the image.
+
+    Attributes:
+        nodes: (l, m, 2) lines and samples.
+        t: (l, m, 3) derivatives by the affine parameters at the nodes.
+        t_evenly: (e, 3) those at the even places.
+        seen: for each direction, covariance (2, l or 1, m or 1, n), by coordinate, of nodes and points.
+        seen_evenly: (2, e, n) that of the even places.
+        among_evenly: (e, e) of each component, correlation of the even places, over what chips see.
+    """
+
+    nodes: Array
+    t: Array
+    t_evenly: Array
+    seen: list[Array]
+    seen_evenly: Array
+    among_evenly: list[Array]
+
+
+def _places(
+    components: Sequence[Component],
+    residuals: Residuals,
+    line: Array,
+    sample: Array,
+    shape: tuple[int, int],
+) -> _Places:
+    """The places of nodes at lines (l,) and samples (m,)."""
     nodes = np.stack(np.meshgrid(line, sample, indexing="ij"), axis=-1)
     frame = no_correction(shape)
-    t = by_affine(nodes, frame)
     # What moves whole lines is the same at all nodes of a line: one column is enough.
     parts = [
         (nodes[_WHERE[along]], [one for one in components if one.along == along])
         for along in dict.fromkeys(one.along for one in components)
     ]
-    full = with_components(residuals, components)
     axes = [np.linspace(nodes[0], nodes[-1], _OF_THE_AFFINE) for nodes in (line, sample)]
     evenly = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    t_evenly = by_affine(evenly, frame)
-    fitted = np.linalg.pinv(t_evenly)
-    seen_of_parts = [_seen(places, some, residuals.line_sample) for places, some in parts]
-    seen_everywhere = _seen(evenly[None], components, residuals.line_sample)
-    among_evenly = [one.correlation(evenly, evenly) / one.seen**2 for one in components]
-    parameters, covariance, displacement, variance = [], [], [], []
-    for k in range(2):
-        inverse = np.linalg.inv(full.covariance[k])
-        weighted = inverse @ full.design
-        normal = full.design.T @ weighted + np.diag(expected[k])
-        own = np.asarray(np.linalg.pinv(normal, hermitian=True), np.float64)
-        value = own @ (weighted.T @ full.misfit[:, k])
-        rest = full.misfit[:, k] - full.design @ value
-        seen = [both[k] for both in seen_of_parts]
-        gain = [one @ inverse for one in seen]
-        moved = sum(one @ full.design for one in gain)
-        explained = sum(np.einsum("kmn,kmn->km", first, second) for first in gain for second in seen)
-        unseen = sum(one.variance_px2[k] / one.seen**2 * one.share(nodes) for one in components)
-        left = padded(t, len(own)) - moved
-        total = unseen - explained + (left @ own * left).sum(axis=-1)
-        mean = np.broadcast_to(sum(one @ rest for one in gain), t.shape[:2])
-        # Its affine part belongs to the parameters: both are uncertain by much more than their sum.
-        seen_evenly = seen_everywhere[k, 0]
-        gain_evenly = seen_evenly @ inverse
-        affine = fitted @ gain_evenly @ rest
-        left = padded(t_evenly, len(own)) - gain_evenly @ full.design
-        among = sum(
-            one.variance_px2[k] * shared for one, shared in zip(components, among_evenly, strict=True)
-        )
-        errors = among - gain_evenly @ seen_evenly.T + left @ own @ left.T
-        uncertain = fitted @ errors @ fitted.T
-        value[:3] += affine
-        own[:3, :3] = uncertain
-        parameters.append(value)
-        covariance.append(own)
-        displacement.append(mean - t @ affine)
-        variance.append(np.maximum(total, 0.0) - (t @ uncertain * t).sum(axis=-1))
-    breaks = np.array([one.at_px + one.length_px / 2.0 for one in components if one.kind == "break"])
-    grid = DisplacementGrid(line, sample, np.stack(displacement, -1), np.stack(variance, -1), breaks)
-    return ProfileSolution(np.array(parameters), np.array(covariance), grid)
+    return _Places(
+        nodes,
+        by_affine(nodes, frame),
+        by_affine(evenly, frame),
+        [_seen(some, of_some, residuals.line_sample) for some, of_some in parts],
+        _seen(evenly[None], components, residuals.line_sample)[:, 0],
+        [one.correlation(evenly, evenly) / one.seen**2 for one in components],
+    )
+
+
+@dataclass(frozen=True)
+class _Coordinate:
+    """Lines or samples: parameters (k,) with covariance (k, k), displacement and variance (l, m)."""
+
+    parameters: Array
+    covariance: Array
+    displacement: Array
+    variance: Array
+
+
+def _coordinate(
+    k: int, full: Residuals, components: Sequence[Component], expected: Array, places: _Places
+) -> _Coordinate:
+    """The solution of one coordinate, by a priori weights (k,) of its parameters."""
+    inverse = np.linalg.inv(full.covariance[k])
+    weighted = inverse @ full.design
+    normal = full.design.T @ weighted + np.diag(expected)
+    own = np.asarray(np.linalg.pinv(normal, hermitian=True), np.float64)
+    value = own @ (weighted.T @ full.misfit[:, k])
+    rest = full.misfit[:, k] - full.design @ value
+    seen, t = [both[k] for both in places.seen], places.t
+    gain = [one @ inverse for one in seen]
+    moved = sum(one @ full.design for one in gain)
+    explained = sum(np.einsum("kmn,kmn->km", first, second) for first in gain for second in seen)
+    unseen = sum(one.variance_px2[k] / one.seen**2 * one.share(places.nodes) for one in components)
+    left = padded(t, len(own)) - moved
+    total = unseen - explained + (left @ own * left).sum(axis=-1)
+    mean = np.broadcast_to(sum(one @ rest for one in gain), t.shape[:2])
+    # Its affine part belongs to the parameters: both are uncertain by much more than their sum.
+    affine, uncertain = _affine_part(
+        places,
+        full,
+        variances_px2=[one.variance_px2[k] for one in components],
+        seen=places.seen_evenly[k],
+        inverse=inverse,
+        own=own,
+        rest=rest,
+    )
+    value[:3] += affine
+    own[:3, :3] = uncertain
+    variance = np.maximum(total, 0.0) - (t @ uncertain * t).sum(axis=-1)
+    return _Coordinate(value, own, mean - t @ affine, variance)
+
+
+def _affine_part(
+    places: _Places,
+    full: Residuals,
+    *,
+    variances_px2: list[float],
+    seen: Array,
+    inverse: Array,
+    own: Array,
+    rest: Array,
+) -> tuple[Array, Array]:
+    """The affine part (3,) of the displacement of one coordinate, and the covariance (3, 3) of both.
+
+    Args:
+        places: of the displacement.
+        full: the measures.
+        variances_px2: of the components.
+        seen: (e, n) covariance of the even places and the measures.
+        inverse: (n, n) weights of the measures.
+        own: (k, k) covariance of the parameters.
+        rest: (n,) what the parameters leave of the measures.
+    """
+    fitted = np.linalg.pinv(places.t_evenly)
+    gain = seen @ inverse
+    left = padded(places.t_evenly, len(own)) - gain @ full.design
+    pairs = zip(variances_px2, places.among_evenly, strict=True)
+    among = sum(variance * shared for variance, shared in pairs)
+    errors = among - gain @ seen.T + left @ own @ left.T
+    return fitted @ gain @ rest, fitted @ errors @ fitted.T
 
 
 def by_affine(places: Array, frame: ImageCorrection) -> Array:

@@ -6,7 +6,7 @@ import numpy as np
 
 from amers.services.errors import CoverageError
 from amers.services.geodesy import metres_per_degree_at
-from amers.services.misfit.image_correction import SceneAdjustment
+from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.quality.accuracy import Accuracy, NormalisedError, accuracy, normalised_error
 from amers.services.quality.criteria import at_most, verdict_of
 from amers.services.quality.qualification import Qualification

@@ -7,7 +7,7 @@ import numpy as np
 
 from amers.services.errors import ComputationError
 from amers.services.matching.chip_shears import ChipShears
-from amers.services.misfit.image_correction import SceneAdjustment
+from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.quality.accuracy import Statistics, statistics
 from amers.services.quality.lack_of_fit import Elsewhere
 from amers.services.sensors.base import SensorModel

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from amers.services.matching.control_points import ChipSearch, match_points, with_matches
-from amers.services.misfit.image_correction import SceneAdjustment
+from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.quality.missed_along import UNFOUND, missed_along
 from amers.services.registration.context import PointContext, Prediction
 from amers.services.registration.search import Search, adjust_search, select_inliers

@@ -17,7 +17,7 @@ from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import CachedImage
 from amers.services.matching.consensus import Voters
 from amers.services.matching.control_points import ChipSearch, match_points
-from amers.services.misfit.image_correction import SceneAdjustment
+from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.quality.frames import shared_frame
 from amers.services.quality.lack_of_fit import Elsewhere
 from amers.services.quality.qualification import Qualification, qualify

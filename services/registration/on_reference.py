@@ -24,7 +24,7 @@ from amers.services.matching.reference_image import (
     match_places,
     visible_places,
 )
-from amers.services.misfit.image_correction import SceneAdjustment
+from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.quality.stability import image_places
 from amers.services.registration.broken import naming_breaks
 from amers.services.registration.context import (

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from amers.services.errors import InputError
 from amers.services.matching.control_points import MatchingOptions
 from amers.services.matching.reference_image import ReferenceMatchingOptions
-from amers.services.misfit.image_correction import AdjustmentOptions
+from amers.services.misfit.scene_adjustment import AdjustmentOptions
 from amers.services.quality.qualification import QualificationOptions
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from amers.services.imagery.scene import Scene
-from amers.services.misfit.image_correction import SceneAdjustment
+from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.registration.search import Search
 from amers.services.sensors.correction import CorrectedModel
 from amers.services.types import Array, ControlPoints, Measures

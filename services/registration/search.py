@@ -22,7 +22,8 @@ from amers.services.matching.consensus import (
 )
 from amers.services.matching.control_points import PointMatches
 from amers.services.misfit.control_observations import ControlObservations
-from amers.services.misfit.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
+from amers.services.misfit.image_correction import adjust_scene
+from amers.services.misfit.scene_adjustment import AdjustmentOptions, SceneAdjustment
 from amers.services.quality.frames import shared_frame
 from amers.services.registration.context import Candidate, NotFound, Prediction, SearchStage
 from amers.services.sensors.base import SensorModel

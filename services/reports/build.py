@@ -7,7 +7,7 @@ import numpy as np
 from amers.services.imagery.scene import Scene, scene_footprint, scene_gsd_m
 from amers.services.misfit.affine_fit import Order
 from amers.services.misfit.displacement_components import BENDS, Component
-from amers.services.misfit.image_correction import SceneAdjustment
+from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.quality.criteria import VERDICT_EXPLANATIONS, verdict_scope
 from amers.services.registration.on_points import Registration
 from amers.services.registration.options import RegistrationOptions

@@ -7,7 +7,7 @@ import numpy as np
 
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import reduce_image, render_chip
-from amers.services.misfit.image_correction import SceneAdjustment
+from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.registration.on_points import Registration
 from amers.services.sensors.displacement import DisplacementGrid
 from amers.services.types import (

@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from amers.services.misfit.control_observations import ControlObservations
-from amers.services.misfit.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
+from amers.services.misfit.image_correction import adjust_scene
+from amers.services.misfit.scene_adjustment import AdjustmentOptions, SceneAdjustment
 from amers.services.quality.stability import AdjustedScene
 from amers.services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
 from amers.services.types import UNKNOWN_FRAME, Array, BoolArray, Frame, Measures

@@ -11,7 +11,8 @@ from amers.services.formats.sensor_models.refined_model import write_refined
 from amers.services.imagery.scene import Scene
 from amers.services.misfit.affine_fit import FREE, Order
 from amers.services.misfit.control_observations import ControlObservations
-from amers.services.misfit.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
+from amers.services.misfit.image_correction import adjust_scene
+from amers.services.misfit.scene_adjustment import AdjustmentOptions, SceneAdjustment
 from amers.services.quality.check_points import MARKING_SIGMA_PX, CheckPoints
 from amers.services.sensors.correction import CorrectedModel
 

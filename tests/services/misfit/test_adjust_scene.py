@@ -9,7 +9,8 @@ import pytest
 from amers.services.errors import NotEnoughPoints, UndeterminedCorrection
 from amers.services.misfit.affine_fit import FREE, AffineFit, Order
 from amers.services.misfit.control_observations import ControlObservations
-from amers.services.misfit.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
+from amers.services.misfit.image_correction import adjust_scene
+from amers.services.misfit.scene_adjustment import AdjustmentOptions, SceneAdjustment
 from amers.services.misfit.shared_errors import offset_sigma_px, overlap_correlation
 from amers.services.sensors.correction import ImageCorrection, no_correction
 from amers.services.types import Array, BoolArray

@@ -7,7 +7,8 @@ import pytest
 from scipy.stats import norm
 
 from amers.services.misfit.bends import bends
-from amers.services.misfit.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
+from amers.services.misfit.image_correction import adjust_scene
+from amers.services.misfit.scene_adjustment import AdjustmentOptions, SceneAdjustment
 from amers.services.misfit.structure import Residuals
 from amers.services.quality.normal_law import normal_ce90
 from amers.services.types import Array

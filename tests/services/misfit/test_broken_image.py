@@ -9,7 +9,8 @@ import pytest
 from amers.services.misfit.broken_image import held_parts, placed_steps
 from amers.services.misfit.control_observations import ControlObservations
 from amers.services.misfit.displacement_components import Component
-from amers.services.misfit.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
+from amers.services.misfit.image_correction import adjust_scene
+from amers.services.misfit.scene_adjustment import AdjustmentOptions, SceneAdjustment
 from amers.services.quality.accuracy import normalised_error
 from amers.services.quality.normal_law import normal_ce90
 from amers.services.sensors.correction import ImageCorrection, no_correction

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from amers.services.misfit.control_observations import ControlObservations
-from amers.services.misfit.image_correction import SceneAdjustment, adjust_scene
+from amers.services.misfit.image_correction import adjust_scene
+from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.types import Array, BoolArray
 from tests.services.conftest import FlatModel
 from tests.services.misfit.test_displacement_components import SHAPE, draw

@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from amers.services.misfit.image_correction import SceneAdjustment, adjust_scene
+from amers.services.misfit.image_correction import adjust_scene
+from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.quality.accuracy import normalised_error
 from amers.services.quality.normal_law import normal_ce90
 from amers.services.sensors.correction import ImageCorrection

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from amers.services.misfit.affine_fit import ORDERS, AffineFit
-from amers.services.misfit.image_correction import AdjustmentOptions
 from amers.services.misfit.order_selection import choose_order
+from amers.services.misfit.scene_adjustment import AdjustmentOptions
 
 SIGMA_PX = 0.5
 COUNT = 60

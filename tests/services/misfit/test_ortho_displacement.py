@@ -9,8 +9,9 @@ import pytest
 from amers.services.map_grid import MapGrid
 from amers.services.misfit.affine_fit import AffineFit
 from amers.services.misfit.control_observations import ControlObservations
-from amers.services.misfit.image_correction import SceneAdjustment, adjust_scene
+from amers.services.misfit.image_correction import adjust_scene
 from amers.services.misfit.placed_measures import PlacedMeasures
+from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.quality.accuracy import normalised_error
 from amers.services.quality.normal_law import normal_ce90
 from amers.services.sensors.correction import no_correction

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from amers.services.misfit.control_observations import ControlObservations
-from amers.services.misfit.image_correction import SceneAdjustment, adjust_scene
+from amers.services.misfit.image_correction import adjust_scene
+from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.misfit.short_motion import (
     MAX_CHANCE,
     STRIPS,

@@ -6,7 +6,8 @@ from amers.services.geodesy import ecef_from_lon_lat_h, metres_per_degree_at
 from amers.services.imagery.scene import view_direction
 from amers.services.map_grid import MapGrid
 from amers.services.misfit.control_observations import ControlObservations
-from amers.services.misfit.image_correction import AdjustmentOptions, adjust_scene
+from amers.services.misfit.image_correction import adjust_scene
+from amers.services.misfit.scene_adjustment import AdjustmentOptions
 from amers.services.sensors.correction import CorrectedModel, ImageCorrection
 from amers.services.sensors.ortho import OrthoModel, ReliefDisplacement, fold_into_ortho
 
