@@ -209,13 +209,13 @@ class _Images:
 
     Attributes:
         scenes: of the block.
-        passes: masks of images that may share errors.
+        of_passes: masks of images that may share errors.
         options: of the block.
         neighbour: images of an adjusted block; None without one.
     """
 
     scenes: Sequence[Scene]
-    passes: Sequence[BoolArray]
+    of_passes: Sequence[BoolArray]
     options: ProductionOptions
     neighbour: KnownImages | None
 
@@ -236,7 +236,7 @@ class _Images:
             observations,
             control=control,
             neighbour=self.neighbour,
-            passes=self.passes,
+            passes=self.of_passes,
             options=self.options.block,
         )
 
@@ -266,7 +266,7 @@ class _Images:
 def _ties(images: _Images, work: Work, progress: Progress) -> Observations:
     """The tie points of the images."""
     options = images.options
-    ties = find_tie_points(images.scenes, images.passes, options.features, work, progress)
+    ties = find_tie_points(images.scenes, images.of_passes, options.features, work, progress)
     if len(ties) == 0:
         raise NotEnoughPoints(
             0, options.block.min_points, "tie points: the images have nothing in common"
@@ -333,7 +333,7 @@ def _chosen(
     saliency = np.append(measured.saliency, np.zeros(len(measured.known)))[: len(adjustment.lon_lat_h)]
     if excluded is not None:
         saliency[excluded(adjustment.lon_lat_h[:, :2])] = 0.0
-    dates = _dates(shown, images.passes, len(saliency))
+    dates = _dates(shown, images.of_passes, len(saliency))
     rows = _select_points(adjustment, saliency, shown, dates, options)
     shown = shown.take(np.isin(shown.point, rows))
     return _Chosen(rows, saliency[rows], replace(shown, point=np.searchsorted(rows, shown.point)))
