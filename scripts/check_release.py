@@ -91,6 +91,8 @@ def check_release(folder: Path, *, quick: bool) -> None:
     plugin = contents(next(folder.glob("amers-qgis-*.zip")))
     require("qgisMinimumVersion" in plugin["amers/metadata.txt"].decode(), "the plugin has no metadata")
     with TemporaryDirectory() as temporary:
+        # The server of the database runs as another user where the check runs as root.
+        Path(temporary).chmod(0o711)
         client = Installation(Path(temporary) / "client", client_wheel)
         require("numpy" not in client.packages(), "the client installs NumPy")
         client.program("from amers_client import Client, JobFailed")
