@@ -13,7 +13,7 @@ from amers.app.cli.output import AsJson, Row, show, show_one
 from amers.app.cli.progress import shown_progress
 from amers.app.config import Settings
 from amers.app.errors import InputError
-from amers.app.usecases.demo import DemoOptions, DemoOutcome, run_demo
+from amers.app.usecases.demo import DemoOutcome, run_demo
 from amers.services.quality.accuracy_statement import accuracy_document
 from amers.services.quality.criteria import verdict_scope
 from amers.services.types import Array
@@ -30,7 +30,7 @@ def demo(
     """Run the whole work on a simulated world: images, block, store, registration, report."""
     folder = _empty_folder(output)
     with _private_store() as settings, shown_progress() as progress:
-        outcome = run_demo(folder, settings, DemoOptions(), progress)
+        outcome = run_demo(folder, settings, progress)
     if as_json:
         show_one(_document(outcome), as_json=True)
         return

@@ -1,6 +1,6 @@
 """The whole work on a simulated world, compared with the truth: images, block, store, scene, report."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -38,36 +38,21 @@ from amers.services.simulation.view import (
 from amers.services.simulation.world import World, make_world
 from amers.services.types import Array, Observations, Progress, part_of
 
-
-@dataclass(frozen=True)
-class DemoOptions:
-    """Options of the simulated world and of the work in it.
-
-    Attributes:
-        seed: of all random numbers.
-        size_m, posting_m, relief_m: of the world.
-        views: number of images that the block is made from.
-        shape: lines and samples of all images.
-        gsd_m: ground sampling of all images.
-        block_error_m: error of the models of the block's images, each in a direction of its own.
-        scene_error_m: error of the scene's model, east and north.
-        scene_skew_px: additional error of the scene's model at the edges of the image.
-        production: options of the block.
-    """
-
-    seed: int = 1
-    size_m: float = 2600.0
-    posting_m: float = 1.0
-    relief_m: float = 120.0
-    views: int = 4
-    shape: tuple[int, int] = (2200, 2200)
-    gsd_m: float = 1.0
-    block_error_m: float = 4.0
-    scene_error_m: tuple[float, float] = (40.0, -30.0)
-    scene_skew_px: float = 1.0
-    production: ProductionOptions = field(
-        default_factory=lambda: ProductionOptions(fine_gsd_m=2.0, coarse_gsd_m=10.0, points=250)
-    )
+_SEED = 1
+"""Of all random numbers."""
+_SIZE_M, _POSTING_M, _RELIEF_M = 2600.0, 1.0, 120.0
+"""Of the world."""
+_VIEWS = 4
+"""Images that the block is made from."""
+_SHAPE, _GSD_M = (2200, 2200), 1.0
+"""Lines and samples of all images, and their ground sampling."""
+_BLOCK_ERROR_M = 4.0
+"""Error of the models of the block's images, each in a direction of its own."""
+_SCENE_ERROR_M = (40.0, -30.0)
+"""Error of the scene's model, east and north."""
+_SCENE_SKEW_PX = 1.0
+"""Additional error of the scene's model at the edges of the image."""
+_PRODUCTION = ProductionOptions(fine_gsd_m=2.0, coarse_gsd_m=10.0, points=250)
 
 
 @dataclass(frozen=True)
@@ -117,24 +102,23 @@ class _Truth:
     scene: SimulatedView
 
 
-def run_demo(folder: Path, settings: Settings, options: DemoOptions, progress: Progress) -> DemoOutcome:
+def run_demo(folder: Path, settings: Settings, progress: Progress) -> DemoOutcome:
     """Simulate, produce, ingest, publish, query, register, and compare with the truth.
 
     Args:
         folder: for images, block and report; must be empty.
         settings: of a store for the demonstration alone.
-        options: of the world and the work.
         progress: receives the fraction done and a message.
     """
-    truth = _simulate(options, progress)
+    truth = _simulate(progress)
     images = [_write_image(view, folder / "images") for view in truth.sources]
     image = _write_image(truth.scene, folder / "images")
 
     production = run_image_production(
-        ProductionImages(tuple(images), sigma_m=options.block_error_m),
+        ProductionImages(tuple(images), sigma_m=_BLOCK_ERROR_M),
         folder / "block",
         BlockIdentity("demo", title="Demonstration on a simulated world", license="CC0-1.0"),
-        options.production,
+        _PRODUCTION,
         progress=part_of(progress, 0.3, 0.4),
     )
     with engine.opened(settings) as database:
@@ -143,7 +127,7 @@ def run_demo(folder: Path, settings: Settings, options: DemoOptions, progress: P
         with database.transaction() as connection:
             ingested = lifecycle.ingest_block(connection, storage, folder / "block")
             lifecycle.publish_block(connection, str(ingested.block.number))
-        sigma_m = float(np.hypot(*options.scene_error_m))
+        sigma_m = float(np.hypot(*_SCENE_ERROR_M))
         find_points = points_of_store(database, storage)
         with replacing(folder / "registered") as new:
             registered = run_registration(
@@ -160,36 +144,36 @@ def run_demo(folder: Path, settings: Settings, options: DemoOptions, progress: P
     return _compare(truth, production, registered.registration, counts, report)
 
 
-def _simulate(options: DemoOptions, progress: Progress) -> _Truth:
-    rng = np.random.default_rng(options.seed)
+def _simulate(progress: Progress) -> _Truth:
+    rng = np.random.default_rng(_SEED)
     progress(0.0, "simulating a world")
-    world = make_world(rng, options.size_m, options.posting_m, options.relief_m)
-    progress(0.05, f"simulating {options.views} images for the block")
+    world = make_world(rng, _SIZE_M, _POSTING_M, _RELIEF_M)
+    progress(0.05, f"simulating {_VIEWS} images for the block")
     sources = simulate_block(
         world,
         rng,
-        n_views=options.views,
-        shape=options.shape,
-        gsd_m=options.gsd_m,
-        error_m=options.block_error_m,
+        n_views=_VIEWS,
+        shape=_SHAPE,
+        gsd_m=_GSD_M,
+        error_m=_BLOCK_ERROR_M,
     )
     progress(0.25, "simulating the scene")
-    return _Truth(world, sources, _scene(world, options, rng))
+    return _Truth(world, sources, _scene(world, rng))
 
 
-def _scene(world: World, options: DemoOptions, rng: np.random.Generator) -> SimulatedView:
+def _scene(world: World, rng: np.random.Generator) -> SimulatedView:
     lon, lat = (float(v) for v in world.centre_lon_lat)
     plan = ViewPlan(
         image_id="scene",
         lon_lat=(lon, lat),
-        shape=options.shape,
-        gsd_m=options.gsd_m,
+        shape=_SHAPE,
+        gsd_m=_GSD_M,
         incidence_deg=12.0,
         azimuth_deg=100.0,
         acquired_at=datetime(2024, 8, 20, 10, 30, tzinfo=UTC),
     )
-    skew_px = np.array([[0.0, 0.0, options.scene_skew_px], [0.0, options.scene_skew_px, 0.0]])
-    return simulate_view(world, plan, rng, options.scene_error_m, skew_px)
+    skew_px = np.array([[0.0, 0.0, _SCENE_SKEW_PX], [0.0, _SCENE_SKEW_PX, 0.0]])
+    return simulate_view(world, plan, rng, _SCENE_ERROR_M, skew_px)
 
 
 def _write_image(view: SimulatedView, folder: Path) -> Path:
@@ -260,10 +244,10 @@ def _frame_error_m(sources: list[SimulatedView], production: Production, origin:
     )
 
 
-def _grid(scene: SimulatedView, world: World, per_side: int = 21) -> Array:
+def _grid(scene: SimulatedView, world: World) -> Array:
     """Ground points (n, 3) that the scene shows, on a regular grid of the image."""
     lines, samples = scene.pixels.shape
-    axes = np.linspace(0.0, lines - 1.0, per_side), np.linspace(0.0, samples - 1.0, per_side)
+    axes = np.linspace(0.0, lines - 1.0, 21), np.linspace(0.0, samples - 1.0, 21)
     line_sample = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     ground = true_ground(scene, world, line_sample)
     return np.asarray(ground[np.isfinite(ground).all(axis=1)])

@@ -96,7 +96,6 @@ class AffineFit:
         active: BoolArray,
         free: BoolArray,
         slope_px: float = np.inf,
-        weights: Array | None = None,
     ) -> tuple[Array, Array]:
         """Parameters (2, 3 + b) and covariance (2, 3 + b, 3 + b), zero where not free.
 
@@ -104,11 +103,8 @@ class AffineFit:
             active: (n,) measures that are used.
             free: (2, 3) parameters that are estimated.
             slope_px: a priori standard deviation of drift and skew.
-            weights: (n,) robust weights; all one when None.
         """
         weight = 1.0 / self.variance[active].T
-        if weights is not None:
-            weight = weight * weights[active]
         normal = weight @ self.products[active]
         right = (weight * self.misfit[active].T) @ self.design[active]
         inverse = inverse_normal(

@@ -39,7 +39,6 @@ def find_in_block(
     scenes: Sequence[Scene],
     points: ControlPoints,
     control: Control,
-    work: Work | None = None,
     progress: Progress = no_progress,
 ) -> FoundControl:
     """Control in the images of an adjusted block, by the rays of its models.
@@ -48,7 +47,6 @@ def find_in_block(
         scenes: images of the block with their adjusted models; some are enough.
         points: of the block; `views.images` has the names of the scenes.
         control: of any kind.
-        work: computes the tasks; by default in this process.
         progress: receives the fraction done.
 
     Raises:
@@ -58,7 +56,7 @@ def find_in_block(
     order = np.argsort(_part_of_ground(points.lon_lat_h), kind="stable")
     own = points.take(order)
     measured = MeasuredPoints(own.lon_lat_h, frame, float(own.views.gsd_m.min()), _seen(scenes, own))
-    observations, known = with_control(scenes, measured, control, work=work or Work(), progress=progress)
+    observations, known = with_control(scenes, measured, control, work=Work(), progress=progress)
     count = len(own) + len(known)
     met = intersect([scene.model for scene in scenes], observations, count)
     lon_lat_h = np.concatenate([own.lon_lat_h, met.lon_lat_h[len(own) :]])

@@ -16,7 +16,7 @@ from amers.services.matching.reference_image import (
 )
 from amers.services.quality.site_errors import Site, SiteErrors, frame_of_site_m2, reasons_of
 from amers.services.terrain import Terrain
-from amers.services.types import Array, Progress, no_progress
+from amers.services.types import Array
 
 _PLACES = 225
 """Places of a site that are compared with one image."""
@@ -44,7 +44,6 @@ def image_errors(
     site: Site,
     terrain: Terrain | None,
     reach_m: float,
-    progress: Progress = no_progress,
 ) -> SiteErrors:
     """Errors of the positions that an image gives at a site, by its model and the terrain.
 
@@ -57,7 +56,6 @@ def image_errors(
         site: place and ortho-image.
         terrain: of the site; None only for images that are ortho-images.
         reach_m: largest error that is expected.
-        progress: receives the fraction of the places done.
 
     Raises:
         InputError: heights move what the image shows, and there is no terrain.
@@ -73,7 +71,7 @@ def image_errors(
     factor = max(1, int(image_gsd_m(reference.model, middle[0]) / scene_m))
     places = visible_places(scene.model, reference, line_sample, factor, _MATCHING.window_px)
     radius_px = min(max(2, math.ceil(reach_m / (factor * scene_m))), _FARTHEST_PX)
-    matches = match_places(scene.image, places, radius_px, _MATCHING, progress)
+    matches = match_places(scene.image, places, radius_px, _MATCHING)
     found = matches.reason == ""
     n = int(found.sum())
     return SiteErrors(

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amers.services.adjustment.block_problem import BlockOptions
 from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
 from amers.services.adjustment.control_ground import NO_CONTROL, ControlGround, joined_ground
 from amers.services.adjustment.parameters import AdjustableImage
@@ -87,7 +86,6 @@ def site_reach(
     observations: Observations,
     sites: Sequence[KnownSite],
     others: ControlGround = NO_CONTROL,
-    options: BlockOptions = BlockOptions(),
 ) -> SiteReach:
     """The errors at all sites of blocks that know one of them, and the moves of the images' corners.
 
@@ -99,7 +97,6 @@ def site_reach(
         observations: of tie points and of the points of the sites.
         sites: two or more.
         others: control of all adjustments: heights of an elevation model.
-        options: of the adjustments.
 
     Raises:
         InputError: fewer than two sites.
@@ -112,7 +109,7 @@ def site_reach(
 
     def adjusted(members: Sequence[KnownSite]) -> BlockAdjustment:
         control = joined_ground([others, *(site.ground for site in members)])
-        return adjust_block(images, observations, control=control, options=options)
+        return adjust_block(images, observations, control=control)
 
     whole = adjusted(sites)
     height_m = float(np.nanmedian(whole.lon_lat_h[:, 2]))

@@ -83,12 +83,12 @@ class Figure:
         path = "".join(f"M{x:.1f} {y:.1f}h.01" for x, y in places.tolist())
         self._path(path, f'{_stroke(colour, diameter, opacity)} stroke-linecap="round"')
 
-    def marks(self, places: Array, shape: str, size: float, colour: str, opacity: float = 1.0) -> None:
+    def marks(self, places: Array, shape: str, size: float, colour: str) -> None:
         """Draw marks of one of the shapes `MARKS` around places (n, 2) of the figure."""
         mark = _MARKS[shape].format(r=f"{size / 2.0:.2f}", d=f"{size:.2f}")
         path = "".join(f"M{x:.1f} {y:.1f}{mark}" for x, y in places.tolist())
         fill = colour if shape not in "x+" else "none"
-        self._path(path, _stroke(colour, 1.0, opacity), fill)
+        self._path(path, _stroke(colour, 1.0), fill)
 
     def line(self, places: Array, colour: str, width: float, opacity: float = 1.0) -> None:
         """Draw a line through places (n, 2) of the figure."""
@@ -245,10 +245,10 @@ def left_margin(values_range: tuple[float, float], count: int = 6) -> float:
     return 22.0 + _CHARACTER * SMALL_TEXT * longest
 
 
-def data_range(values: Array, margin: float = 0.05) -> tuple[float, float]:
+def data_range(values: Array) -> tuple[float, float]:
     """Range of the finite values and zero, with a margin on both sides."""
     finite = np.append(values[np.isfinite(values)], 0.0)
-    return widened(float(finite.min()), float(finite.max()), margin)
+    return widened(float(finite.min()), float(finite.max()))
 
 
 def widened(low: float, high: float, margin: float = 0.05) -> tuple[float, float]:
