@@ -55,10 +55,12 @@ ROUTES = {
         Step("services/registration/on_points.py", "search_scene"),
         Step("services/registration/search.py", "adjust_search"),
         Step("services/misfit/image_correction.py", "adjust_scene"),
+        Step("services/misfit/affine_start.py", "affine_start"),
+        Step("services/misfit/affine_start.py", "_magnitude"),
         Step("services/misfit/affine_fit.py", "AffineFit.solution"),
     ),
     "services/sensors/rpc.py": (
-        Step("services/misfit/image_correction.py", "adjust_scene"),
+        Step("services/misfit/affine_start.py", "affine_start"),
         Step("services/misfit/control_observations.py", "declared_fit"),
         Step("services/sensors/rpc.py", "RpcModel.project"),
     ),
