@@ -56,8 +56,12 @@ def one_for_each(match: re.Match[str]) -> str:
 
 
 def library() -> dict[str, list[str]]:
-    """Pages of the reference and the modules on each: one page for each package of `services`."""
-    pages: dict[str, list[str]] = {"services": []}
+    """Pages of the reference and the modules on each: the library, and each package of `services`."""
+    front = [f"amers.{path.stem}" for path in sorted((ROOT / "amers").glob("*.py"))]
+    pages: dict[str, list[str]] = {
+        "amers": [name for name in front if "__" not in name],
+        "services": [],
+    }
     for path in sorted((ROOT / "services").rglob("*.py")):
         parts = path.relative_to(ROOT).with_suffix("").parts
         if any(part.startswith("_") for part in parts):
@@ -69,7 +73,7 @@ def library() -> dict[str, list[str]]:
 
 def reference_page(page: str, modules: list[str]) -> str:
     """Markdown of one page of the reference."""
-    title = "Basics" if page == "services" else page.capitalize()
+    title = {"amers": "The library", "services": "Basics"}.get(page, page.capitalize())
     return "\n\n".join([f"# {title}", *(f"::: {module}" for module in modules)]) + "\n"
 
 
@@ -152,11 +156,11 @@ def site_page(path: str) -> tuple[str, str] | None:
         return "methods/registration.md", ""
     if path.startswith("docs/"):
         return path.removeprefix("docs/"), ""
-    module = path.removesuffix(".py").replace("/", ".")
+    module = "amers." + path.removesuffix(".py").replace("/", ".")
     for page, modules in library().items():
         if module in modules:
             return f"library/{page}.md", f"#{module}"
-        if module == f"services.{page}":
+        if module == f"amers.services.{page}":
             return f"library/{page}.md", ""
     return None
 

@@ -64,4 +64,4 @@ def test_the_site_asks_nothing_of_the_network(site):
 
 def test_a_link_to_the_code_leads_to_its_reference(site):
     page = (site / "methods/rpc.html").read_text()
-    assert 'href="../library/sensors.html#services.sensors.rpc"' in page
+    assert 'href="../library/sensors.html#amers.services.sensors.rpc"' in page
