@@ -18,7 +18,7 @@ MOST_HEAD_BYTES = 1 << 16
 """Limit of what arrives beside bodies: a head, trailers, sizes of chunks."""
 LINGER_S = 2.0
 """So long the rest of too large a head is thrown away; its sender would miss an abrupt reply."""
-MOST_THROWN_AWAY_BYTES = 4 << 20
+MOST_THROWN_AWAY_BYTES = 10 << 20
 """So much of it: a sender that has not stopped by then does not read the reply."""
 ABSOLUTE = re.compile(rb"[A-Za-z][A-Za-z0-9+.\-]*://([^/?#]*)(.*)", re.DOTALL)
 

@@ -182,9 +182,8 @@ USES: dict[str, WrongUse] = {
             "-o",
             "{new}",
         ),
-        "IMAGES: path '{folder}/a.tif' does not exist; IMAGES: path '{folder}/b.tif' does not "
-        "exist; --dem: "
-        "path '{folder}/c.tif' does not exist; see `amers production ortho --help`",
+        "--dem: path '{folder}/c.tif' does not exist; IMAGES: path '{folder}/a.tif' does not exist; "
+        "IMAGES: path '{folder}/b.tif' does not exist; see `amers production ortho --help`",
     ),
     "several images missing": WrongUse(
         ("production", "run", "--images", "{folder}/a.tif", "--images", "{folder}/b.tif", "-o", "{new}"),

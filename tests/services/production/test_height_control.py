@@ -75,7 +75,7 @@ def test_the_mean_slope_errs_together_and_what_differs_from_it_apart(
 def test_steep_ground_gives_no_heights() -> None:
     known = known_heights(places(), surfaces(80), PLACE_M, ground(0.1, 0.6))
     np.testing.assert_array_equal(known.point, np.arange(40))
-    with pytest.raises(NotEnoughPoints, match="0 of them not steep"):
+    with pytest.raises(NotEnoughPoints, match="0 of them on ground that is not steep"):
         known_heights(places(), surfaces(80), PLACE_M, ground(0.6, 0.6))
 
 
