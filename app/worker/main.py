@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import procrastinate
 import psycopg
@@ -32,6 +33,8 @@ PAUSE_S = 2.0
 """Pause before the queue is read again after an outage of the database."""
 ENDING_S = 60.0
 """A worker that is still there so long after its signal ends at once, whatever its threads wait for."""
+
+QUEUE_ERRORS = (procrastinate.exceptions.ConnectorException, psycopg.Error)
 
 log = logging.getLogger(__name__)
 
@@ -93,6 +96,16 @@ def _sweeping(
         sweeper.join()
 
 
+def _log_left_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Log the error of a task that nobody waits for: an outage of the queue in one sentence."""
+    error = context.get("exception")
+    if isinstance(error, QUEUE_ERRORS):
+        # A ticket stays as taken; what became of its job was written by another connection.
+        log.warning("the queue cannot be written: %s", (outage_of(error) or NO_ANSWER).reason)
+    else:
+        loop.default_exception_handler(context)
+
+
 @dataclass
 class _Worker:
     database: Database
@@ -105,6 +118,7 @@ class _Worker:
         """Fetch and do jobs until a signal; an outage of the database does not end the worker."""
         rounds = asyncio.create_task(self._rounds())
         loop = asyncio.get_running_loop()
+        loop.set_exception_handler(_log_left_error)
         for number in ENDING:
             loop.add_signal_handler(number, self._stop, rounds)
         try:
@@ -120,7 +134,7 @@ class _Worker:
         while not self.stop.is_set():
             try:
                 await self._work()
-            except (procrastinate.exceptions.ConnectorException, psycopg.Error) as error:
+            except QUEUE_ERRORS as error:
                 log.warning("the queue cannot be read: %s", (outage_of(error) or NO_ANSWER).reason)
             await asyncio.sleep(PAUSE_S)
 

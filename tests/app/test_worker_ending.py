@@ -1,13 +1,17 @@
 """A worker that receives a signal ends, whatever its queue still runs."""
 
+import asyncio
+import gc
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import psycopg
 import pytest
 
 from amers.app.config import Settings
+from amers.app.worker import main
 from tests.app.worker_processes import wait_until
 from tests.command_line import environment_of
 
@@ -70,3 +74,25 @@ def test_a_worker_ends_although_a_task_ignores_its_cancellation_or_a_thread_neve
     finally:
         worker.kill()
         worker.wait()
+
+
+def test_an_error_of_the_queue_that_nobody_waits_for_is_one_sentence(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async def fail(error: Exception) -> None:
+        raise error
+
+    async def leave(error: Exception) -> None:
+        asyncio.get_running_loop().set_exception_handler(main._log_left_error)
+        task = asyncio.create_task(fail(error))
+        await asyncio.sleep(0)
+        del task
+        gc.collect()
+
+    asyncio.run(leave(psycopg.OperationalError("server closed the connection unexpectedly")))
+    assert [record.message for record in caplog.records] == [
+        "the queue cannot be written: the connection to the database was lost"
+    ]
+    caplog.clear()
+    asyncio.run(leave(ValueError("a defect")))
+    assert [record.exc_info is not None for record in caplog.records] == [True]
