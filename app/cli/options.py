@@ -38,9 +38,9 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     one. Its help is the text of the field below `Attributes:` in the docstring of the dataclass.
 
     A `bool` is a flag, and a `tuple[X, ...]` an option that is given repeatedly. A `Path` is a file or a
-    folder that must exist. What typer knows beside, such as bounds, another name (`--name`) or a short
-    one (`-n`), is stated by `Annotated[TYPE, typer.Option(…)]` in the dataclass or by `Shown` in the
-    command; a path with it may be missing, unless it says `exists=True`.
+    folder that must exist. `Annotated[TYPE, typer.Option(…)]` in the dataclass, or `Shown` in the
+    command, adds bounds, another name (`--name`) or a short name (`-n`). A path that has one of these
+    may be missing, unless it has `exists=True`.
     """
     hints = get_type_hints(command, include_extras=True)
     parameters = []

@@ -256,7 +256,8 @@ class Storage:
                 yield Path(folder)
         finally:
             with suppress(OSError, StorageOutage):
-                if self.look() != place:
+                # The folder of a storage of another installation stays: that has a marker.
+                if self.look() != place and self.look_closely()[1] is None:
                     (self.folder / UNFINISHED).rmdir()
 
     def fetch(self, key: str, folder: Path) -> Path:

@@ -443,3 +443,20 @@ def test_a_job_under_way_leaves_the_mount_point_empty(client: TestClient, mount:
     with pytest.raises(StorageOutage):
         work()
     mount.mount()  # It checks that nothing was written into the mount point.
+
+
+def test_a_job_under_way_takes_nothing_from_a_storage_of_another_installation(
+    client: TestClient, mount: Mount
+) -> None:
+    storage: Storage = client.app.state.storage  # type: ignore[attr-defined]
+    other = Storage(mount.folder)
+
+    def work() -> None:
+        with storage.scratch_folder("job-"):
+            mount.unmount()
+            write_marker(other, Marker(uuid4(), 1))
+            other.scratch()
+
+    with pytest.raises(StorageOutage):
+        work()
+    assert (mount.folder / "unfinished").is_dir()

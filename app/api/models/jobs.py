@@ -74,8 +74,8 @@ class JobError(Reply):
 class StatusInfo(Reply):
     """The state of a job.
 
-    `status` says whether the job ran to its end; `amers:verdict` says whether its registration can be
-    used. A job that failed after a search has a report too, under a link.
+    `status` is that of the job; `amers:verdict` is that of its registration: good, usable or failed. A
+    job that failed after a search has a report too, under a link.
 
     `amers:sceneNames` are the names of the scenes among the inputs.
     `amers:relative_to_control_points` and `amers:on_the_earth` are the accuracy that the registration of
