@@ -11,6 +11,7 @@ from amers.services.errors import CoverageError
 from amers.services.geodesy import metres_per_degree_at
 from amers.services.imagery.source import ArrayImage, ImageSource, Window
 from amers.services.map_grid import MapGrid
+from amers.services.statements import Statements
 from amers.services.types import Array, FloatImage, IntArray
 
 Geoid = Callable[[Array], Array]
@@ -31,12 +32,14 @@ class Terrain:
         heights: metres above the geoid, or above the ellipsoid without one; NaN in voids.
         geoid: vertical datum of the heights; None for the ellipsoid.
         vertical: origin of the vertical datum, one sentence.
+        statements: of its files.
     """
 
     grid: MapGrid
     heights: ImageSource
     geoid: Geoid | None = None
     vertical: str = "metres above the ellipsoid"
+    statements: Statements = ()
 
     @property
     def posting_m(self) -> float:

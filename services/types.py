@@ -8,6 +8,8 @@ from typing import Any, Protocol, Self
 import numpy as np
 import numpy.typing as npt
 
+from amers.services.statements import Statements
+
 Array = npt.NDArray[np.float64]
 FloatImage = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
@@ -208,11 +210,13 @@ class GroundPoints:
         id: (n,) str, unique.
         lon_lat_h: (n, 3); the height is NaN where unknown.
         sigma_m: (n, 3) east, north, up, one standard deviation; NaN where unknown.
+        statements: of their file.
     """
 
     id: StrArray
     lon_lat_h: Array
     sigma_m: Array
+    statements: Statements = ()
 
     def __len__(self) -> int:
         return len(self.id)

@@ -9,6 +9,7 @@ from amers.services.geodesy import ecef_from_east_north_up
 from amers.services.imagery.source import ImageSource, image_gsd_m
 from amers.services.sensors.base import SensorModel
 from amers.services.sensors.parameter_sets import ParameterSet
+from amers.services.statements import Statements
 from amers.services.types import Acquisition, Array
 
 FOOTPRINT_PER_SIDE = 8
@@ -27,6 +28,7 @@ class Scene:
             coordinate, metres.
         parameter_set: what is free in its rigorous model where scenes are registered together; None for
             a correction in the image.
+        statements: of its files.
     """
 
     image: ImageSource
@@ -34,6 +36,7 @@ class Scene:
     acquisition: Acquisition
     sigma_m: float
     parameter_set: ParameterSet | None = None
+    statements: Statements = ()
 
 
 def scene_centre(scene: Scene) -> Array:

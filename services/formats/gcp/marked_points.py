@@ -34,6 +34,7 @@ from amers.services.formats.elevation.geoid import (
     missing_grids,
     vertical_crs,
 )
+from amers.services.statements import Statements
 from amers.services.types import Array, BoolArray, StrArray
 
 WGS84_3D = CRS.from_epsg(4979)
@@ -61,6 +62,7 @@ class MarkedPoints:
         residual_px: (n, 2) observed minus computed, line and sample; NaN where unknown.
         active: (n,) whether the mark is to be used.
         check: (n,) whether the point is a check point, held out of the adjustment.
+        statements: of the file.
     """
 
     id: StrArray
@@ -72,6 +74,7 @@ class MarkedPoints:
     residual_px: Array
     active: BoolArray
     check: BoolArray
+    statements: Statements = ()
 
     def __len__(self) -> int:
         return len(self.id)
@@ -83,19 +86,22 @@ class MarkedPoints:
 
     def take(self, rows: BoolArray) -> "MarkedPoints":
         """The marks where a mask (n,) is true."""
-        return MarkedPoints(**{name: values[rows] for name, values in vars(self).items()})
+        columns = {name: values[rows] for name, values in vars(self).items() if name != "statements"}
+        return MarkedPoints(**columns, statements=self.statements)
 
 
 def marked_points(
     id: list[str],
     lon_lat_h: list[tuple[float, float, float]] | Array,
     line_sample: list[tuple[float, float]] | Array,
+    statements: Statements = (),
     **attributes: Any,
 ) -> MarkedPoints:
     """Marked points with default attributes: unknown sigmas and residuals, active, no check points.
 
     Args:
         id, lon_lat_h, line_sample: n rows.
+        statements: of the file.
         attributes: other attributes of `MarkedPoints`, n rows, that replace the defaults.
     """
     n = len(id)
@@ -116,6 +122,7 @@ def marked_points(
         lon_lat_h=np.array(lon_lat_h, dtype=np.float64).reshape(n, 3),
         line_sample=np.array(line_sample, dtype=np.float64).reshape(n, 2),
         **columns,
+        statements=statements,
     )
 
 

@@ -110,7 +110,7 @@ def read_ground_points(path: Path, stated: StatedByCaller = StatedByCaller()) ->
     """
     used = _used(_read(path, stated), path)
     rows = np.sort(np.unique(used.id, return_index=True)[1])
-    return GroundPoints(used.id[rows], used.lon_lat_h[rows], used.sigma_m[rows])
+    return GroundPoints(used.id[rows], used.lon_lat_h[rows], used.sigma_m[rows], used.statements)
 
 
 def _used(marks: MarkedPoints, path: Path) -> MarkedPoints:

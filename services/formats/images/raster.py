@@ -28,6 +28,7 @@ from amers.services.formats.images.working_copy import Pixels, open_pixels
 from amers.services.imagery.source import Window
 from amers.services.map_grid import MapGrid
 from amers.services.sensors.rpc import RpcModel
+from amers.services.statements import Statements
 from amers.services.types import FloatImage
 
 # An image that is not rectified has a sensor model instead of a map grid.
@@ -51,6 +52,7 @@ class RasterImage:
         pixels: the dataset from which pixels are read: the same one, or a working copy.
         mix: the bands and their weights.
         codes: statements of the product about its pixels, in addition to those of the file.
+        statements: of the file, and what became of them.
     """
 
     path: FilePlace
@@ -58,6 +60,7 @@ class RasterImage:
     pixels: Pixels
     mix: BandMix
     codes: PixelCodes = field(default_factory=PixelCodes)
+    statements: Statements = ()
 
     @property
     def band(self) -> int:

@@ -25,6 +25,7 @@ from amers.services.formats.sensor_models.rpc_text import (
 )
 from amers.services.formats.text_files import parse_number, read_text
 from amers.services.sensors.rpc import RpcModel, check_rpc
+from amers.services.statements import Statements
 
 Convention = Literal["tags", "text", "rpb", "dimap", "geom", "rigorous"]
 
@@ -46,6 +47,7 @@ class DeliveredModel:
         crop_origin: line and sample of the first pixel of the image in the image that the file models;
             subtracted from the image offsets of the file.
         note: one sentence: where the model was found, and why it was shifted or not.
+        statements: of the files that were looked at.
     """
 
     model: RpcModel
@@ -53,6 +55,7 @@ class DeliveredModel:
     convention: Convention
     crop_origin: tuple[float, float]
     note: str
+    statements: Statements = ()
 
 
 def read_rpc(

@@ -24,6 +24,7 @@ import shapely
 
 from amers.services.errors import FormatError, InputError
 from amers.services.formats.vector.plain_geojson import plain_geojson
+from amers.services.statements import Statements
 from amers.services.types import IntArray
 
 DRIVERS = {
@@ -62,6 +63,7 @@ class VectorLayer:
         crs: code or WKT of the reference system; None when there is none, or an unknown one.
         fid: (n,) numbers of the features where the format keeps them; None otherwise.
         unusable: rows whose geometry cannot be used and is missing, each with the reason.
+        statements: of the file.
     """
 
     name: str
@@ -70,6 +72,7 @@ class VectorLayer:
     crs: str | None
     fid: IntArray | None = None
     unusable: dict[int, str] = field(default_factory=dict)
+    statements: Statements = ()
 
     def changed(
         self, geometries: Geometries, columns: dict[str, npt.NDArray[Any]], crs: str | None

@@ -1,0 +1,54 @@
+"""All readers of files that others write, with what becomes of each statement in such a file."""
+
+from amers.services.formats.reader_rows import Reader
+
+READERS: tuple[Reader, ...] = ()
+"""In the order of `docs/inputs.md`."""
+
+OWN_FILES = frozenset(
+    {
+        "parse_block_json",
+        "parse_chip_header",
+        "parse_correction",
+        "parse_correction_accuracy",
+        "parse_frame",
+        "read_adjusted_images",
+        "read_block",
+        "read_chip_file",
+        "read_document",
+        "read_feature_csv",
+        "read_map_tile",
+        "read_points",
+        "read_runs",
+        "read_views",
+    }
+)
+"""Functions that read files of a defined format which Amers writes, and checks as a whole."""
+PARTS = frozenset(
+    {
+        "load_json",
+        "open_dataset",
+        "open_pixels",
+        "parse_area",
+        "parse_bands",
+        "parse_columns",
+        "parse_crs",
+        "parse_footprint",
+        "parse_imaging_time",
+        "parse_item",
+        "parse_mask",
+        "parse_number",
+        "parse_numbers",
+        "parse_polygons",
+        "parse_xml",
+        "read_control_points",
+        "read_ground_points",
+        "read_marked_ground",
+        "read_masks",
+        "read_rpc",
+        "read_text",
+        "open_base_chip",
+        "read_base_chips",
+    }
+)
+"""Functions that read a part of a file, or choose its reader; the readers that they serve have rows."""
