@@ -207,7 +207,7 @@ Row = dict[str, Any]
 
 
 def _points_from_rows(rows: list[Row]) -> MarkedPoints:
-    columns = {name: [row[name] for row in rows] for name in rows[0]} if rows else {}
+    columns: dict[str, Any] = {name: [row[name] for row in rows] for name in rows[0]} if rows else {}
     return marked_points(
         columns.pop("id", []), columns.pop("lon_lat_h", []), columns.pop("line_sample", []), **columns
     )

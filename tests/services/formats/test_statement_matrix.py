@@ -20,14 +20,9 @@ for module in pkgutil.iter_modules(statements.__path__):
 
 def reading_functions() -> set[str]:
     """Public functions of `services/formats` whose names say that they read something."""
-    names = set[str]()
-    for path in (ROOT / "services/formats").rglob("*.py"):
-        for node in ast.parse(path.read_text()).body:
-            if isinstance(node, ast.FunctionDef) and node.name.startswith(
-                ("read_", "parse_", "open_", "load_")
-            ):
-                names.add(node.name)
-    return names
+    bodies = [ast.parse(path.read_text()).body for path in (ROOT / "services/formats").rglob("*.py")]
+    functions = [node.name for body in bodies for node in body if isinstance(node, ast.FunctionDef)]
+    return {name for name in functions if name.startswith(("read_", "parse_", "open_", "load_"))}
 
 
 @pytest.mark.parametrize("cell", CELLS, ids=str)
