@@ -18,6 +18,7 @@ from amers.services.formats.images.bands import parse_bands
 from amers.services.formats.images.scenes import read_scene
 from amers.services.imagery import scene as imagery
 from amers.services.sensors.base import SensorModel
+from amers.services.statements import Statements
 from amers.services.terrain import Terrain as TerrainGrid
 from amers.services.types import Array, ControlPoints, point_chips
 
@@ -75,6 +76,11 @@ class Scene:
     def footprint(self) -> Array:
         """Outline (m, 2) of the ground that the image can show: longitude, latitude; not closed."""
         return imagery.scene_footprint(self.content)
+
+    @property
+    def statements(self) -> Statements:
+        """What its files state, and what became of each statement: used, assumed or not used."""
+        return self.content.statements
 
     def close(self) -> None:
         """Close its files."""
@@ -137,6 +143,11 @@ class Terrain:
             f"  {lines} x {samples} heights, one every {self.grid.posting_m:.2f} m\n"
             f"  vertical datum: {self.grid.vertical}"
         )
+
+    @property
+    def statements(self) -> Statements:
+        """What its files state, and what became of each statement: used, assumed or not used."""
+        return self.grid.statements
 
     def height_m(self, lon_lat: ArrayLike) -> Array:
         """Heights above the ellipsoid of one place or of many, metres.

@@ -22,6 +22,7 @@ from amers.app.usecases.registration.reference_source import (
     CoveringReference,
     ReferenceFiles,
     given_reference,
+    read_reference,
     register_on,
 )
 from amers.app.usecases.registration.register import ControlSources, SceneFiles, run_registration
@@ -209,7 +210,9 @@ def register_on_reference(
         return _registered(scene, sources, outputs, options, progress)
     _refuse_without_folder(check_points, copy_image)
     covering = CoveringReference(files.image.name, files)
-    return register_on(covering, as_scene(scene).content, options, progress)[0]
+    opened = read_reference(files)
+    content = as_scene(scene).content
+    return register_on(covering, opened, content, options, progress=progress)[0]
 
 
 def register_together(

@@ -88,4 +88,4 @@ def gathered(statements: Iterable[Statement]) -> Statements:
 
 def worth_saying(statements: Iterable[Statement]) -> Statements:
     """The statements that a terminal shows: what was assumed, and what was not used."""
-    return tuple(statement for statement in statements if statement.use is not Use.USED)
+    return tuple(statement for statement in statements if statement.use != Use.USED)

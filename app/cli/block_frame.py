@@ -62,6 +62,7 @@ def frame(
             "points": len(placed.points),
             **_placed_row(placed),
             **accuracy_row(placed.points, as_json=as_json),
+            "statements": placed.statements,
         },
         as_json=as_json,
     )

@@ -155,4 +155,5 @@ def _row(production: Production, output: Path, *, as_json: bool) -> Row:
         **control_row(production.control, production.adjustment),
         **effort_row(production.effort, as_json=as_json),
         **accuracy_row(production.points, as_json=as_json),
+        "statements": production.statements,
     }

@@ -4,7 +4,7 @@ import dataclasses
 import json
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,6 +13,7 @@ from uuid import UUID
 import typer
 
 from amers.app.printable import printable
+from amers.services.statements import Statement, gathered, worth_saying
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
@@ -44,13 +45,30 @@ def _show_table(rows: Sequence[Row]) -> None:
 
 
 def show_one(record: Row, *, as_json: bool) -> None:
-    """Print one record as a JSON object, or as one line per field."""
+    """Print one record as a JSON object, or as one line per field.
+
+    What files state, under `statements`, is an array in JSON; people get it by `show_statements`.
+    """
     if as_json:
         print_json(record)
         return
+    record = dict(record)
+    statements: Any = record.pop("statements", ())
+    show_statements(statements)
     width = max(map(len, record), default=0)
     for name, value in record.items():
         typer.echo(f"{name:<{width}}  {as_text(value)}")
+
+
+def show_statements(statements: Iterable[Statement | Mapping[str, Any]]) -> None:
+    """Print on standard error what was assumed of files, and what they state and was not used.
+
+    Args:
+        statements: as readers return them, or as members of a JSON document.
+    """
+    stated = [one if isinstance(one, Statement) else Statement(**one) for one in statements]
+    for statement in worth_saying(gathered(stated)):
+        typer.echo(f"amers: {printable(str(statement))}", err=True)
 
 
 def print_json(value: object) -> None:

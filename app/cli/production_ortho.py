@@ -62,6 +62,7 @@ def ortho(
             "chip_gsds_m": list(production.gsds_m),
             **agreement_row(production.shift_m, production.local_sigma_m),
             **accuracy_row(production.points, as_json=as_json),
+            "statements": production.statements,
         },
         as_json=as_json,
     )

@@ -108,6 +108,7 @@ def points(
             ),
             **agreement_row(production.shift_m, production.local_sigma_m),
             **accuracy_row(production.points, as_json=as_json),
+            "statements": production.statements,
         },
         as_json=as_json,
     )

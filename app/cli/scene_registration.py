@@ -185,7 +185,9 @@ def outcome_of(
                 outcome = registered_outcome(request, register_one(request, new, receiver))
             except (InputError, ComputationError) as error:
                 _keep_only_failure(request, new, error)
-                outcome = {**failed_outcome(request, error), "output": request.folder}
+                run = json.loads((new / "report.json").read_text(encoding="utf-8"))["run"]
+                outcome = failed_outcome(request, error)
+                outcome |= {"output": request.folder, "statements": run.get("statements", [])}
     except (AmersError, ServiceError) as error:
         return failed_outcome(request, error)
     return {**outcome, "seconds": round(time.monotonic() - started, 2)}
@@ -233,6 +235,7 @@ def registered_outcome(request: SceneRequest, report: dict[str, Any]) -> Outcome
         "residual_rms_px": report["image_residuals_px"]["xy"]["rms"],
         **_check_figures(report["checks"]),
         "output": request.folder,
+        "statements": report["run"].get("statements", []),
     }
 
 

@@ -1,6 +1,7 @@
 """What the registrations of one scene and of many refuse and print alike."""
 
 import math
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -9,7 +10,7 @@ import typer
 
 from amers.app.cli.arguments import by_options
 from amers.app.cli.exit_status import SUCCESS
-from amers.app.cli.output import print_json, show, show_one
+from amers.app.cli.output import print_json, show, show_one, show_statements
 from amers.app.cli.scene_registration import Outcome
 from amers.app.errors import InputError
 from amers.services.quality.accuracy_statement import ON_THE_EARTH, RELATIVE
@@ -50,6 +51,7 @@ def show_outcome(outcome: Outcome, *, as_json: bool) -> None:
     if as_json:
         print_json(outcome)
     else:
+        show_statements(outcome.get("statements", []))
         show_one(_verdict_rows(outcome) | _other_rows(outcome, tuple(outcome)), as_json=False)
 
 
@@ -58,6 +60,7 @@ def show_outcomes(outcomes: list[Outcome], *, as_json: bool) -> None:
     if as_json:
         print_json(outcomes)
         return
+    show_statements(chain(*(outcome.get("statements", []) for outcome in outcomes)))
     rows = []
     for outcome in outcomes:
         row = _verdict_rows(outcome) | _other_rows(outcome, _TABLE)
@@ -100,7 +103,7 @@ def _verdict_rows(outcome: Outcome) -> dict[str, Any]:
 
 def _other_rows(outcome: Outcome, names: tuple[str, ...]) -> dict[str, Any]:
     """The other figures of an outcome, for people."""
-    shown = {"scene", "verdict", "verdict_scope", *_STATED}
+    shown = {"scene", "verdict", "verdict_scope", "statements", *_STATED}
     return {name: _rounded(outcome.get(name)) for name in names if name not in shown}
 
 

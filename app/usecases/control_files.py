@@ -159,6 +159,7 @@ def _ortho(path: Path, sigma_m: float | None, stack: ExitStack) -> ControlOrtho:
         height_sigma_m=math.nan,
         common_sigma_m=COMMON_SIGMA_PX * gsd_m,
         frame=Frame.from_sigmas(stated_m, math.nan),
+        statements=scene.statements,
     )
     return ControlOrtho(path.name, reference)
 

@@ -5,9 +5,10 @@ import pickle
 import shutil
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ from amers.services.reports.block_adjustment import adjustment_report, points_cs
 from amers.services.reports.block_adjustment_pages import ADJUSTMENT_PAGE
 from amers.services.sensors.refined import refined_rpc
 from amers.services.sensors.rpc import RpcModel
+from amers.services.statements import gathered
 from amers.services.tasks import Work
 from amers.services.types import Progress, no_progress, part_of
 
@@ -114,6 +116,8 @@ def run_image_production(
             excluded=ground.excluded,
             work=work,
         )
+        stated = chain(*(scene.statements for scene in scenes), control.statements)
+        production = replace(production, statements=gathered(stated))
         write_block(
             folder,
             _metadata(identity, scenes, production, options, control.neighbour),

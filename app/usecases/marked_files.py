@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from amers.services.formats.gcp.reader import StatedByCaller, read_marked_ground
 from amers.services.imagery.scene import Scene
 from amers.services.production.marked_control import MarkedGround
 from amers.services.quality.check_points import MARKING_SIGMA_PX
+from amers.services.statements import gathered
 from amers.services.types import Array, Frame, IntArray, Observations
 
 
@@ -86,6 +88,7 @@ def read_marked(
         sigma_m=sigma_m[first],
         frame=Frame.from_sigmas(*points.frame_sigma_m),
         marks=observations,
+        statements=gathered(chain(*(marks.statements for marks in files))),
     )
 
 

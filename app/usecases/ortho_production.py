@@ -3,7 +3,8 @@
 import math
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 from amers.app.errors import InputError
@@ -27,6 +28,7 @@ from amers.services.production.ortho_production import (
     OrthoPoints,
     produce_ortho_points,
 )
+from amers.services.statements import gathered
 from amers.services.types import Progress, no_progress, part_of
 
 
@@ -84,7 +86,10 @@ def run_ortho_production(
         for image in files.images:
             scenes.append(read_scene(image, sigma_m=files.sigma_m, bands=bands, mask=files.mask))
             stack.callback(scenes[-1].image.close)  # type: ignore[attr-defined]
-        production = produce_ortho_points(scenes, heights, options, part_of(progress, 0.0, 0.7))
+        production = replace(
+            produce_ortho_points(scenes, heights, options, part_of(progress, 0.0, 0.7)),
+            statements=gathered(chain(*(scene.statements for scene in scenes), heights.statements)),
+        )
         write_block(
             folder,
             _ortho_metadata(identity, scenes, production, options),

@@ -17,7 +17,13 @@ from amers.app.db.tokens import Token
 from amers.app.errors import InputError, TooLarge
 from amers.app.usecases import quotas
 from amers.app.usecases.damage import named_by_row, suspecting_damage
-from amers.app.usecases.processes import Commit, Process, Work
+from amers.app.usecases.processes import (
+    STATEMENTS_VALUE,
+    Commit,
+    Process,
+    Work,
+    stated_document,
+)
 from amers.app.usecases.quotas import FREE_ROOM
 from amers.app.usecases.registered_scene import REFINED_NAME
 from amers.app.usecases.results import store_results
@@ -43,6 +49,7 @@ from amers.services.orthorectification.rectify import (
     choose_grid,
     orthorectify,
 )
+from amers.services.statements import Statements, gathered
 from amers.services.types import Progress, no_progress
 
 ORTHO_NAME = "ortho.tif"
@@ -79,6 +86,7 @@ class Orthorectified:
         seen: share of its pixels that have data.
         error_px: largest difference from the scene's model where the mapping was checked.
         vertical: how the vertical datum of the terrain is known.
+        statements: of the files of the scene and the terrain.
     """
 
     path: Path
@@ -90,6 +98,7 @@ class Orthorectified:
     seen: float
     error_px: float
     vertical: str
+    statements: Statements = ()
 
     def __repr__(self) -> str:
         return (
@@ -241,6 +250,7 @@ def run_orthorectification(
         seen=counter.pixels / (lines * samples * len(bands)),
         error_px=error_px,
         vertical=ground.vertical,
+        statements=gathered(scene.statements + ground.statements),
     )
 
 
@@ -358,6 +368,7 @@ def _run(work: Work) -> Commit:
             "samples": ortho.samples,
             "seen": ortho.seen,
             "error_px": ortho.error_px,
+            "statements": stated_document(ortho.statements),
             "files": keys,
         }
 
@@ -378,5 +389,6 @@ ORTHORECTIFY = Process(
         "samples": {"type": "integer", "title": "Samples of the map, px"},
         "seen": {"type": "number", "title": "Share of the map's pixels with data"},
         "error_px": {"type": "number", "title": "Largest error of the mapping, px"},
+        "statements": STATEMENTS_VALUE,
     },
 )

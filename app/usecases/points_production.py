@@ -3,6 +3,7 @@
 import math
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from amers.services.production.points_production import (
 )
 from amers.services.production.points_with_chips import OwnChips, produce_points_with_chips
 from amers.services.sensors.rpc import RpcModel
+from amers.services.statements import gathered
 from amers.services.types import Frame, GroundPoints, Progress, no_progress, part_of
 
 
@@ -96,6 +98,7 @@ def run_points_production(
         if files.chips is not None:
             own = _own_chips(files.points, files.chips, files.chip_origin)
             production = produce_points_with_chips(ground, own, frame, make)
+            production = replace(production, statements=gathered(ground.statements))
         else:
             bands = None if files.bands is None else parse_bands(files.bands)
             scenes = []
@@ -103,6 +106,8 @@ def run_points_production(
                 scenes.append(read_scene(image, sigma_m=files.sigma_m, bands=bands))
                 stack.callback(scenes[-1].image.close)  # type: ignore[attr-defined]
             production = produce_known_points(ground, scenes, frame, options, make)
+            stated = chain(ground.statements, *(scene.statements for scene in scenes))
+            production = replace(production, statements=gathered(stated))
         models = {
             scene.acquisition.image_id: scene.model
             for scene in production.scenes
@@ -200,7 +205,8 @@ def _ground_points(files: KnownPointFiles) -> GroundPoints:
     lon_lat_h[missing, 2] = terrain.height_m(lon_lat_h[missing, :2])
     sigma_m = sigma_m.copy()
     sigma_m[missing, 2] = files.height_sigma_m or HEIGHT_SIGMA_POSTINGS * terrain.posting_m
-    return replace(ground, lon_lat_h=lon_lat_h, sigma_m=sigma_m)
+    statements = ground.statements + terrain.statements
+    return replace(ground, lon_lat_h=lon_lat_h, sigma_m=sigma_m, statements=statements)
 
 
 def _or_nan(value: float | None) -> float:

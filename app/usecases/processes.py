@@ -16,6 +16,7 @@ from amers.app.errors import AmersError, InputError
 from amers.app.json_values import unusable_value
 from amers.app.storage import Storage
 from amers.services.docstrings import attribute_descriptions
+from amers.services.statements import Statements
 from amers.services.types import Progress
 
 Commit = Callable[[Connection], dict[str, Any]]
@@ -69,6 +70,19 @@ def results_folder(job_id: UUID) -> str:
 def result_name(key: str) -> str:
     """The name of a file among the results of its job, by its key in the storage."""
     return key.split("/", 3)[3]
+
+
+STATEMENTS_VALUE: dict[str, Any] = {
+    "type": "array",
+    "items": {"type": "object"},
+    "title": "What the files state, and whether it was used, assumed or not used",
+}
+"""Schema of the output `statements`, which `stated_document` makes."""
+
+
+def stated_document(statements: Statements) -> list[dict[str, Any]]:
+    """What files state, as the output `statements` of a job."""
+    return [asdict(statement) for statement in statements]
 
 
 @dataclass(frozen=True)

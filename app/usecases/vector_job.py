@@ -13,7 +13,13 @@ from amers.app.db.engine import Connection
 from amers.app.db.tokens import Token
 from amers.app.errors import InputError
 from amers.app.usecases.damage import named_by_row, suspecting_damage
-from amers.app.usecases.processes import Commit, Process, Work
+from amers.app.usecases.processes import (
+    STATEMENTS_VALUE,
+    Commit,
+    Process,
+    Work,
+    stated_document,
+)
 from amers.app.usecases.registered_scene import SceneModel
 from amers.app.usecases.results import store_results
 from amers.app.usecases.scene_inputs import (
@@ -196,6 +202,7 @@ def _correct(work: Work) -> Commit:
             "left_out": list(corrected.left_out),
             "unusable": {str(number): why for number, why in corrected.unusable.items()},
             "renamed": corrected.renamed,
+            "statements": stated_document(corrected.statements),
             **accuracy_document(statement),
             "files": stored,
         }
@@ -229,6 +236,7 @@ def _project(work: Work) -> Commit:
             "left_out": list(projected.left_out),
             "unusable": {str(number): why for number, why in projected.unusable.items()},
             "renamed": projected.renamed,
+            "statements": stated_document(projected.statements),
             "files": stored,
         }
 
@@ -258,6 +266,7 @@ _COUNTS: dict[str, dict[str, Any]] = {
         "type": "object",
         "title": "Attributes with a name that the format reserves, each with its new name",
     },
+    "statements": STATEMENTS_VALUE,
 }
 
 CORRECT_VECTORS = Process(

@@ -31,6 +31,7 @@ from amers.services.imagery.scene import Scene
 from amers.services.map_grid import check_map, check_map_code
 from amers.services.quality.accuracy_statement import StatedAccuracy, vertices_accuracy
 from amers.services.quality.correction_accuracy import CorrectionAccuracy
+from amers.services.statements import Statements, gathered
 from amers.services.terrain import Terrain
 from amers.services.types import IntArray
 from amers.services.vectors.accuracy import ErrorSources
@@ -64,6 +65,7 @@ class CorrectedFile:
         renamed: attributes that have other names in the file, with these.
         height_sigma_m: of the terrain, as used.
         relative_to_control_points, on_the_earth: predicted accuracy of the vertices.
+        statements: of the files of the scene, the terrain and the vectors.
     """
 
     path: Path
@@ -78,6 +80,7 @@ class CorrectedFile:
     on_the_earth: StatedAccuracy
     unusable: dict[int, str]
     renamed: dict[str, str]
+    statements: Statements = ()
 
     def __repr__(self) -> str:
         relative, on_the_earth = self.relative_to_control_points, self.on_the_earth
@@ -101,7 +104,7 @@ class ProjectedFile:
         hidden_vertices: that other ground hides from the sensor.
         outside: features that the scene does not show.
         left_out: numbers of the features, from 1, with a place without a height of the ground.
-        unusable, renamed: as for `CorrectedFile`.
+        unusable, renamed, statements: as for `CorrectedFile`.
     """
 
     path: Path
@@ -114,6 +117,7 @@ class ProjectedFile:
     left_out: tuple[int, ...]
     unusable: dict[int, str]
     renamed: dict[str, str]
+    statements: Statements = ()
 
 
 _CORRECTION = CorrectionOptions()
@@ -176,6 +180,7 @@ def correct_file(
         stated.on_the_earth,
         by_number(layer.unusable),
         renamed,
+        gathered(scene.statements + ground.statements + layer.statements),
     )
 
 
@@ -283,6 +288,7 @@ def project_file(
         tuple((np.flatnonzero(missed) + 1).tolist()),
         by_number(layer.unusable),
         renamed,
+        gathered(scene.statements + ground.statements + layer.statements),
     )
 
 

@@ -22,6 +22,7 @@ from amers.services.matching.control_points import PointMatches
 from amers.services.matching.correlate import FOUND, CorrelationOptions, find_chip
 from amers.services.matching.radiometry import mark_clouds, patch_statistics
 from amers.services.sensors.base import SensorModel
+from amers.services.statements import Statements
 from amers.services.terrain import Terrain
 from amers.services.types import (
     UNKNOWN_FRAME,
@@ -52,6 +53,7 @@ class Reference:
         common_sigma_m: error that all positions measured on the image share, one standard deviation a
             coordinate: shadows and roofs lean the same way everywhere.
         frame: position of the whole image on the Earth, and of the heights of the terrain.
+        statements: of its files.
     """
 
     image: ImageSource
@@ -61,6 +63,7 @@ class Reference:
     height_sigma_m: float
     common_sigma_m: float
     frame: Frame = UNKNOWN_FRAME
+    statements: Statements = ()
 
 
 @dataclass(frozen=True)

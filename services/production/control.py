@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from amers.services.production.height_control import (
 )
 from amers.services.production.marked_control import MarkedGround, known_marks
 from amers.services.production.ortho_control import ControlOrtho, known_on_ortho
+from amers.services.statements import Statements
 from amers.services.tasks import Work
 from amers.services.types import Array, Frame, Observations, Progress, joined_observations, part_of
 
@@ -39,6 +41,14 @@ class Control:
     orthos: tuple[ControlOrtho, ...] = ()
     heights: tuple[ControlHeights, ...] = ()
     neighbour: KnownImages | None = None
+
+    @property
+    def statements(self) -> Statements:
+        """Of the files of the control, but for blocks."""
+        parts = [one.statements for one in self.marked]
+        parts += [one.reference.statements for one in self.orthos]
+        parts += [one.terrain.statements for one in self.heights]
+        return tuple(chain.from_iterable(parts))
 
 
 @dataclass(frozen=True)

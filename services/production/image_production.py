@@ -28,6 +28,7 @@ from amers.services.production.image_passes import image_passes
 from amers.services.production.point_views import check_image_names, shows_chip
 from amers.services.production.tie_points import find_tie_points
 from amers.services.quality.density import GroundMask
+from amers.services.statements import Statements
 from amers.services.tasks import Effort, Work
 from amers.services.types import (
     Array,
@@ -118,6 +119,7 @@ class Production:
         image_fits: how every image fits.
         point_fits: how the points fit, in their order.
         effort: what every stage took; "adjustment" is all that is not done in tasks.
+        statements: of the files, as far as the caller adds them.
     """
 
     points: ControlPoints
@@ -129,6 +131,7 @@ class Production:
     image_fits: tuple[ImageFit, ...]
     point_fits: PointFits
     effort: Mapping[str, Effort]
+    statements: Statements = ()
 
 
 def produce_points(

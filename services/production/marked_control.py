@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from amers.services.adjustment.control_ground import ControlGround
+from amers.services.statements import Statements
 from amers.services.types import Array, Frame, Observations
 
 
@@ -18,6 +19,7 @@ class MarkedGround:
         sigma_m: (n, 3) of east, north, up, one standard deviation, relative to the frame.
         frame: error on the Earth that all of them share.
         marks: their positions in images.
+        statements: of their files.
     """
 
     names: tuple[str, ...]
@@ -25,6 +27,7 @@ class MarkedGround:
     sigma_m: Array
     frame: Frame
     marks: Observations
+    statements: Statements = ()
 
 
 def known_marks(marked: MarkedGround, first_point: int) -> tuple[Observations, ControlGround]:

@@ -17,6 +17,7 @@ from amers.services.matching.multi_image import chip_inside
 from amers.services.production.detail_points import detail_points, detail_saliency
 from amers.services.production.point_views import check_image_names, chips_of
 from amers.services.production.view_agreement import AgreedViews, agreed_views
+from amers.services.statements import Statements
 from amers.services.terrain import Terrain
 from amers.services.types import (
     Array,
@@ -79,6 +80,11 @@ class GroundHeights:
     sigma_m: float
     frame_sigma_m: float = math.nan
 
+    @property
+    def statements(self) -> Statements:
+        """Of the files of the terrain."""
+        return () if self.terrain is None else self.terrain.statements
+
     def at(self, lon_lat: Array) -> Array:
         """Heights (n,) at longitudes and latitudes (n, 2), metres; NaN where unknown."""
         if self.terrain is not None:
@@ -99,6 +105,7 @@ class OrthoPoints:
         shift_m: (k, 2) east, north, by which each image lay off the first one.
         local_sigma_m: horizontal error of details relative to the rest of their image, from the
             disagreement of the images; NaN where nothing shows it.
+        statements: of the files, as far as the caller adds them.
     """
 
     points: ControlPoints
@@ -107,6 +114,7 @@ class OrthoPoints:
     outline: Array
     shift_m: Array
     local_sigma_m: float
+    statements: Statements = ()
 
 
 def produce_ortho_points(

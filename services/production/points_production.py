@@ -14,6 +14,7 @@ from amers.services.matching.multi_image import chip_inside
 from amers.services.production.detail_points import detail_points, detail_saliency
 from amers.services.production.point_views import check_image_names, chips_of
 from amers.services.production.view_agreement import AgreedViews, agreed_views
+from amers.services.statements import Statements
 from amers.services.types import (
     Array,
     BoolArray,
@@ -78,6 +79,7 @@ class KnownPoints:
         shift_m: (k, 2) east, north, by which each image lay off the earlier ones.
         local_sigma_m: horizontal error of details relative to the rest of their image, from the
             disagreement of the images; NaN where nothing shows it.
+        statements: of the files, as far as the caller adds them.
     """
 
     points: ControlPoints
@@ -89,6 +91,7 @@ class KnownPoints:
     left_out: dict[str, int]
     shift_m: Array
     local_sigma_m: float
+    statements: Statements = ()
 
 
 def produce_known_points(

@@ -12,6 +12,7 @@ from amers.services.quality.criteria import at_most, verdict_of
 from amers.services.quality.qualification import Qualification
 from amers.services.quality.stability import ImageResiduals, residuals_in_image
 from amers.services.sensors.base import SensorModel
+from amers.services.statements import Statements
 from amers.services.types import Array, Frame
 
 MARKING_SIGMA_PX = 0.5
@@ -28,12 +29,14 @@ class CheckPoints:
         line_sample: (n, 2) where the image shows them.
         sigma_m: (n, 3) of east, north, up, one standard deviation; NaN where unknown: 0 is used.
         sigma_px: (n,) of the marks, a coordinate; NaN where unknown: 0.5 px is used.
+        statements: of their file.
     """
 
     lon_lat_h: Array
     line_sample: Array
     sigma_m: Array
     sigma_px: Array
+    statements: Statements = ()
 
 
 @dataclass(frozen=True)

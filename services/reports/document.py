@@ -11,6 +11,7 @@ import math
 import types
 from dataclasses import Field, fields, is_dataclass
 from datetime import datetime
+from enum import StrEnum
 from typing import (
     Any,
     Literal,
@@ -159,6 +160,8 @@ def _value_schema(hint: Any, definitions: dict[str, Any]) -> dict[str, Any]:
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Literal:
         return {"enum": list(arguments)}
+    if isinstance(hint, type) and issubclass(hint, StrEnum):
+        return {"enum": [member.value for member in hint]}
     if origin is np.ndarray:
         return {"type": "array", "items": {"$ref": "#/$defs/Numbers"}}
     if origin is tuple:

@@ -19,6 +19,7 @@ from amers.services.reports.gallery import chip_uri
 from amers.services.reports.plot import Figure
 from amers.services.reports.reasons import reason_label
 from amers.services.reports.scene_words import flat_options
+from amers.services.statements import worth_saying
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,9 @@ def page_template(name: str) -> Template:
     words = (numbers.criterion_value, numbers.criterion_limit, reason_label, scene_words.time_words)
     environment.filters.update({one.__name__: one for one in (*filters, *words, chip_uri)})
     shared = (scene_words.scene_facts, scene_words.centre_words, scene_words.run_foot)
-    environment.globals.update({one.__name__: one for one in (figure, flat_options, *shared)})
+    environment.globals.update(
+        {one.__name__: one for one in (figure, flat_options, worth_saying, *shared)}
+    )
     return environment.get_template(name)
 
 

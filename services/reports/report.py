@@ -21,6 +21,7 @@ from amers.services.registration.context import SearchStage
 from amers.services.registration.options import RegistrationOptions
 from amers.services.reports.figure_data import FigureData
 from amers.services.reports.reasons import ReasonCount
+from amers.services.statements import Statements
 from amers.services.types import Acquisition, Array
 
 REPORT_FORMAT = "amers-registration-report/4"
@@ -53,6 +54,7 @@ class RunRecord:
         method: whether on control points or on a reference image.
         blocks: the blocks whose points were used, or the reference image.
         options: of the registration.
+        statements: of the files that were read, and what became of each.
     """
 
     software_version: str
@@ -61,6 +63,7 @@ class RunRecord:
     method: Method
     blocks: tuple[BlockUsed, ...]
     options: RegistrationOptions
+    statements: Statements = ()
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version as installed_version
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,7 @@ from amers.services.production.placed_block import (
 )
 from amers.services.quality.accuracy import Accuracy, NormalisedError, accuracy, normalised_error
 from amers.services.sensors.rpc import RpcModel
+from amers.services.statements import Statements, gathered
 from amers.services.types import Array, ChipArray, ControlPoints, Frame, Progress, no_progress, part_of
 
 
@@ -48,6 +50,7 @@ class PlacedBlock:
         control: names of the known ground.
         check: errors at the check points after the translation; None without any.
         normalised: of these errors, over what is declared; None without any.
+        statements: of the files of the control, the check points and the images.
     """
 
     points: ControlPoints
@@ -56,6 +59,7 @@ class PlacedBlock:
     control: tuple[str, ...]
     check: Accuracy | None
     normalised: NormalisedError | None
+    statements: Statements = ()
 
 
 def place_block(
@@ -90,16 +94,25 @@ def place_block(
     models = _models(block, document)
     with ExitStack() as stack:
         scenes = [_scene(path, models, stack) for path in images]
+        stated = [scene.statements for scene in scenes]
 
         def find(files: ControlFiles, share: Progress) -> FoundControl:
             known = read_control(files, scenes, images, stack)
+            stated.append(known.statements)
             return find_in_block(scenes, points, known, progress=share)
 
         found = find(control, part_of(progress, 0.0, 0.4))
         checked = None if check is None else find(check, part_of(progress, 0.4, 0.3))
         fit = fit_frame(points.frames[0], found.known, found.lon_lat_h, found.covariance_m2)
         moved = replace(moved_points(points, fit.translation_m), frames=(fit.frame,))
-        placed = PlacedBlock(moved, points.frames[0], fit, found.known.names, *_check(fit, checked))
+        placed = PlacedBlock(
+            moved,
+            points.frames[0],
+            fit,
+            found.known.names,
+            *_check(fit, checked),
+            statements=gathered(chain(*stated)),
+        )
         chips = stack.enter_context(FolderChips(block))
         write_block(
             folder,

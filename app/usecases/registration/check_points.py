@@ -30,7 +30,7 @@ def read_check_points(path: Path, heights: str | None, image: Path, scene: Scene
     if len(marks) == 0:
         raise InputError(f"{path.name}: all {len(every)} points are switched off; switch some on")
     lon_lat_h = ground_positions(marks, path, scene)
-    return CheckPoints(lon_lat_h, marks.line_sample, marks.sigma_m, marks.sigma_px)
+    return CheckPoints(lon_lat_h, marks.line_sample, marks.sigma_m, marks.sigma_px, marks.statements)
 
 
 def marks_of_scene(path: Path, heights: str | None, image: Path) -> MarkedPoints:

@@ -26,6 +26,7 @@ from amers.services.reports.failure import (
 )
 from amers.services.reports.failure_pages import FAILURE_PAGE
 from amers.services.reports.report import BlockUsed, RunRecord
+from amers.services.statements import Statement, gathered
 from amers.services.types import Array
 
 
@@ -42,6 +43,7 @@ class Attempt:
         control: points around the scene, once they were looked for.
         reference: name of the reference image, once it was chosen; "" before.
         stages: summaries of the searches, also of one that was refused.
+        statements: of the files read, but for those of the scene.
     """
 
     image: Path
@@ -52,10 +54,12 @@ class Attempt:
     control: ControlSet | None = None
     reference: str = ""
     stages: list[SearchStage] = field(default_factory=list)
+    statements: list[Statement] = field(default_factory=list)
 
     def run_record(self) -> RunRecord:
         """How and when the registration was run; it ends now."""
         blocks = () if self.control is None else self.control.blocks
+        of_scene = () if self.scene is None else self.scene.statements
         return RunRecord(
             software_version=version("amers"),
             started_at=self.started_at,
@@ -63,6 +67,7 @@ class Attempt:
             method="reference image" if self.reference else "control points",
             blocks=(BlockUsed(self.reference, "reference image"),) if self.reference else blocks,
             options=self.options,
+            statements=gathered([*of_scene, *self.statements]),
         )
 
 

@@ -15,6 +15,7 @@ from amers.services.misfit.image_correction import adjust_scene
 from amers.services.misfit.scene_adjustment import AdjustmentOptions, SceneAdjustment
 from amers.services.quality.check_points import MARKING_SIGMA_PX, CheckPoints
 from amers.services.sensors.correction import CorrectedModel
+from amers.services.statements import Statements, gathered
 
 
 @dataclass(frozen=True, repr=False)
@@ -25,11 +26,13 @@ class Refinement:
         model: of the scene, with its correction.
         adjustment: the correction, its covariance, and the residuals of the marks.
         files: with the refined model; none where no folder was given.
+        statements: of the files of the scene and of the marks.
     """
 
     model: CorrectedModel
     adjustment: SceneAdjustment
     files: tuple[Path, ...] = ()
+    statements: Statements = ()
 
     def __repr__(self) -> str:
         adjustment = self.adjustment
@@ -61,7 +64,7 @@ def read_marks(path: Path, heights: str | None, image: Path, scene: Scene) -> Ch
             f"{path.name}: all {len(marks)} marks are check points or switched off; switch some on"
         )
     ground = ground_positions(used, path, scene)
-    return CheckPoints(ground, used.line_sample, used.sigma_m, used.sigma_px)
+    return CheckPoints(ground, used.line_sample, used.sigma_m, used.sigma_px, used.statements)
 
 
 def refine_on_marks(scene: Scene, marks: CheckPoints, order: Order | None = None) -> Refinement:
@@ -91,7 +94,9 @@ def refine_on_marks(scene: Scene, marks: CheckPoints, order: Order | None = None
         np.nan_to_num(marks.sigma_m)[:, None, :] ** 2 * np.eye(3),
     )
     adjustment = adjust_scene(scene.model, scene.image.shape, observations, options)
-    return Refinement(CorrectedModel(scene.model, adjustment.correction), adjustment)
+    statements = gathered(scene.statements + marks.statements)
+    model = CorrectedModel(scene.model, adjustment.correction)
+    return Refinement(model, adjustment, statements=statements)
 
 
 def written(

@@ -77,17 +77,26 @@ def given_reference(files: ReferenceFiles) -> FindReference:
 
 def register_on(
     covering: CoveringReference,
+    reference: Reference,
     scene: Scene,
     options: RegistrationOptions,
+    *,
     progress: Progress,
     stages: list[SearchStage] | None = None,
 ) -> tuple[Registration, ControlSet]:
-    """Register a scene on a reference; `stages` receives the searches, also one that is refused.
+    """Register a scene on a reference.
+
+    Args:
+        covering: names the reference, with the places where earlier scenes matched it.
+        reference: opened from its files.
+        scene: as delivered.
+        options: of the registration.
+        progress: receives the fraction done and a message.
+        stages: receives the searches, also one that is refused.
 
     Returns:
         The registration, and its places on the reference as control points.
     """
-    reference = read_reference(covering.files)
     registration = register_on_reference(
         scene,
         reference,
@@ -136,6 +145,7 @@ def read_reference(files: ReferenceFiles) -> Reference:
         frame=Frame.from_sigmas(
             *(math.nan if sigma_m is None else sigma_m for sigma_m in (files.sigma_m, files.sigma_up_m))
         ),
+        statements=image.statements + (() if terrain is None else terrain.statements),
     )
 
 

@@ -19,6 +19,7 @@ from amers.app.usecases.registration.failure import Attempt, write_failure
 from amers.app.usecases.registration.reference_source import (
     CoveringReference,
     FindReference,
+    read_reference,
     register_on,
 )
 from amers.services.conventions import MAX_ERROR_SIGMAS
@@ -161,6 +162,7 @@ def _register_and_write(
     check_points = None
     if files.check_points is not None:
         check_points = read_check_points(files.check_points, files.check_heights, files.image, scene)
+        attempt.statements.extend(check_points.statements)
 
     registration, reference = _register(scene, sources, attempt, part_of(progress, 0.0, 0.9))
 
@@ -304,8 +306,10 @@ def _register(
     if reference is None:
         raise no_control
     attempt.reference = reference.name
+    opened = read_reference(reference.files)
+    attempt.statements.extend(opened.statements)
     registration, attempt.control = register_on(
-        reference, scene, attempt.options, progress, attempt.stages
+        reference, opened, scene, attempt.options, progress=progress, stages=attempt.stages
     )
     return registration, reference
 
