@@ -25,7 +25,7 @@ from amers.app.errors import AmersError, ComputationError, InputError
 from amers.app.usecases import storage_identity
 from amers.app.usecases.references import references_of_store
 from amers.app.usecases.registration.control_sources import points_of_block, points_of_store
-from amers.app.usecases.registration.failure import Attempt, write_failure
+from amers.app.usecases.registration.failure import Attempt, has_report, write_failure
 from amers.app.usecases.registration.reference_source import ReferenceFiles, given_reference
 from amers.app.usecases.registration.register import (
     ControlSources,
@@ -176,8 +176,12 @@ def _register_accepted(
 def outcome_of(
     register_one: Register, request: SceneRequest, progress: Progress | None = None
 ) -> Outcome:
-    """The outcome of one scene; its progress is shown, unless it is received by `progress`."""
+    """The outcome of one scene; its progress is shown, unless it is received by `progress`.
+
+    An error that should not happen is raised again, once its report is in its place.
+    """
     started = time.monotonic()
+    unexpected = None
     try:
         with ExitStack() as shown, replacing(request.folder) as new:
             receiver = progress or shown.enter_context(shown_progress())
@@ -188,19 +192,31 @@ def outcome_of(
                 run = json.loads((new / "report.json").read_text(encoding="utf-8"))["run"]
                 outcome = failed_outcome(request, error)
                 outcome |= {"output": request.folder, "statements": run.get("statements", [])}
+            except Exception as error:
+                if isinstance(error, AmersError | ServiceError) or not has_report(error):
+                    raise
+                _keep_only_failure(request, new, error)
+                unexpected = error
     except (AmersError, ServiceError) as error:
         return failed_outcome(request, error)
+    if unexpected is not None:
+        raise unexpected
     return {**outcome, "seconds": round(time.monotonic() - started, 2)}
 
 
-def _keep_only_failure(request: SceneRequest, new: Path, error: AmersError) -> None:
+def _keep_only_failure(request: SceneRequest, new: Path, error: Exception) -> None:
     """Leave nothing but the report of a failure in a new folder."""
+    is_written = (new / "report.json").exists() and _is_of_failure(new / "report.json")
     for path in new.iterdir():
-        if path.name not in REPORT_FILES:
+        if path.name not in REPORT_FILES or not is_written:
             path.unlink()
-    if not (new / "report.json").exists():
+    if not is_written:
         attempt = Attempt(request.files.image, request.command, RegistrationOptions())
         write_failure(new, attempt, error)
+
+
+def _is_of_failure(report: Path) -> bool:
+    return bool(json.loads(report.read_text(encoding="utf-8"))["verdict"] == NOT_REGISTERED)
 
 
 def failed_outcome(request: SceneRequest, error: Exception) -> Outcome:

@@ -37,11 +37,13 @@ def gradient_image(pixels: FloatImage) -> FloatImage:
         pixels: (r, c); NaN where there is no data.
 
     Returns:
-        (r - 2, c - 2); NaN beside missing pixels.
+        (r - 2, c - 2), empty for fewer than 3 pixels a side; NaN beside missing pixels.
     """
     with np.errstate(invalid="ignore"):  # between saturated pixels
         down = pixels[2:, 1:-1] - pixels[:-2, 1:-1]
         right = pixels[1:-1, 2:] - pixels[1:-1, :-2]
+    if right.size == 0:
+        return right
     return np.asarray(cv2.sqrt(cv2.magnitude(right, down)))
 
 

@@ -5,7 +5,14 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from amers.services.conventions import MAX_ERROR_SIGMAS
-from amers.services.errors import BrokenImage, CoverageError, NoConsensus, NotEnoughPoints, TurnedImage
+from amers.services.errors import (
+    AmersError,
+    BrokenImage,
+    CoverageError,
+    NoConsensus,
+    NotEnoughPoints,
+    TurnedImage,
+)
 from amers.services.quality.accuracy_statement import AccuracyStatement, StatedAccuracy, no_accuracy
 from amers.services.registration.context import SearchStage
 from amers.services.registration.search import larger_sigma_m
@@ -96,6 +103,9 @@ def next_steps(
         stages: the searches that were made; the last one was refused.
         command: that ran it, without the accuracy of the model.
     """
+    if not isinstance(error, AmersError):
+        text = "Report this error of Amers, with the lines that the command prints in this way."
+        return (NextStep(text, f"AMERS_LOG_LEVEL=debug {command}"),)
     if isinstance(scene, UnreadScene) or not isinstance(
         error, (CoverageError, NoConsensus, NotEnoughPoints)
     ):

@@ -79,6 +79,26 @@ def test_the_command_registers_straight_from_a_block_folder(
     assert largest_error_px(beside, world.true_model) < A_TENTH_OF_A_PIXEL
 
 
+def test_an_error_that_should_not_happen_leaves_its_report(
+    amers: Amers, world: FlatWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def broken(*_: object, **__: object) -> None:
+        raise TypeError("len() of unsized object")
+
+    monkeypatch.setattr("amers.app.usecases.registration.register.register_scene", broken)
+    folder = tmp_path / "out"
+    result = amers("scene", "register", world.tagged, "--block", world.block, "-o", folder)
+    assert result.returncode == 1
+    assert "an error that should not happen: TypeError: len() of unsized object" in result.stderr
+    report = json.loads((folder / "report.json").read_text())
+    validate(report, failure_schema())
+    assert report["reason"] == "an error that should not happen: TypeError: len() of unsized object"
+    (step,) = report["next_steps"]
+    assert step["command"].startswith("AMERS_LOG_LEVEL=debug amers scene register")
+    again = amers("scene", "register", world.tagged, "--block", world.block, "-o", folder)
+    assert "replaces the result of tagged" in again.stderr
+
+
 def test_check_points_are_reported_and_can_take_a_good_verdict_away(
     amers: Amers, world: FlatWorld, tmp_path: Path
 ):

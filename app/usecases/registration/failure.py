@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from amers.app.errors import is_no_memory, is_no_room
+from amers.app.outages import outage_of
 from amers.app.usecases.registration.control_sources import ControlSet
 from amers.app.usecases.report_files import write_report
 from amers.services.errors import AmersError, CoverageError
@@ -71,15 +73,24 @@ class Attempt:
         )
 
 
-def write_failure(folder: Path, attempt: Attempt, error: AmersError) -> None:
+def has_report(error: Exception) -> bool:
+    """Whether a registration that an error has ended leaves a report: all but outages, which end."""
+    if isinstance(error, AmersError):
+        return True
+    return not (outage_of(error) or is_no_room(error) or is_no_memory(error))
+
+
+def write_failure(folder: Path, attempt: Attempt, error: Exception) -> None:
     """Write the report of an attempt that an error has ended into a folder, created when missing."""
     write_report(folder, FAILURE_PAGE, _failure_report(attempt, error))
 
 
-def _failure_report(attempt: Attempt, error: AmersError) -> FailureReport:
+def _failure_report(attempt: Attempt, error: Exception) -> FailureReport:
     name, scene = attempt.image.stem, attempt.scene
     record = UnreadScene(name) if scene is None else scene_record(scene, name)
-    stages = tuple(attempt.stages)
+    stages, reason = tuple(attempt.stages), str(error)
+    if not isinstance(error, AmersError):
+        reason = f"an error that should not happen: {type(error).__name__}: {error}"
     return FailureReport(
         format=FAILURE_FORMAT,
         run=attempt.run_record(),
@@ -89,7 +100,7 @@ def _failure_report(attempt: Attempt, error: AmersError) -> FailureReport:
         on_the_earth=NO_ACCURACY.on_the_earth,
         error=type(error).__name__,
         # The folder of the image may be that of a job on a service.
-        reason=str(error).replace(f"{attempt.image.parent}/", ""),
+        reason=reason.replace(f"{attempt.image.parent}/", ""),
         scene=record,
         visible=_visible(attempt),
         search_stages=stages,

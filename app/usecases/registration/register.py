@@ -15,7 +15,7 @@ from amers.app.usecases.references import record_places
 from amers.app.usecases.registration.check_points import read_check_points
 from amers.app.usecases.registration.control_sources import FindPoints
 from amers.app.usecases.registration.deliverables import write_outputs
-from amers.app.usecases.registration.failure import Attempt, write_failure
+from amers.app.usecases.registration.failure import Attempt, has_report, write_failure
 from amers.app.usecases.registration.reference_source import (
     CoveringReference,
     FindReference,
@@ -23,7 +23,7 @@ from amers.app.usecases.registration.reference_source import (
     register_on,
 )
 from amers.services.conventions import MAX_ERROR_SIGMAS
-from amers.services.errors import ComputationError, CoverageError, InputError
+from amers.services.errors import CoverageError
 from amers.services.formats.images.bands import parse_bands
 from amers.services.formats.images.scenes import read_scene
 from amers.services.formats.sensor_models.refined_model import AdjustedRigorous, write_refined
@@ -126,6 +126,8 @@ def run_registration(
 ) -> RegisteredScene:
     """Register one scene and write the outputs into a folder; for one that fails, a report of that.
 
+    An error that is none of the scene leaves a report, too, and is raised again.
+
     Args:
         files: of the scene.
         sources: of control points and reference images.
@@ -143,8 +145,9 @@ def run_registration(
     attempt = Attempt(files.image, command or f"amers scene register {files.image.name}", options)
     try:
         return _register_and_write(files, sources, folder, attempt, copy_image, progress=progress)
-    except (InputError, ComputationError) as error:
-        write_failure(folder, attempt, error)
+    except Exception as error:
+        if has_report(error):
+            write_failure(folder, attempt, error)
         raise
 
 

@@ -20,6 +20,7 @@ from tests.services.registration.small_ground import (
     predicted,
     scene,
 )
+from tests.services.simulated import MemoryChips
 
 SIGMA_M = 100.0
 OFF_M = np.array([265.0, -205.0])
@@ -75,6 +76,19 @@ def test_an_image_of_the_other_contrast_is_found_by_its_gradients() -> None:
     of = scene(OFF_M, SIGMA_M)
     negative = replace(of, image=ArrayImage(1000.0 - of.image.read(Window(0, 0, 400, 400))))
     assert error_px(found(negative)[0], negative, OFF_M) < 0.5
+
+
+def test_a_search_that_finds_nothing_is_refused_though_some_points_have_no_chip() -> None:
+    """The second try, by gradients, has no gradients of a chip that is missing."""
+    of = scene(OFF_M, SIGMA_M)
+    noise = np.random.default_rng(4).normal(500.0, 50.0, (400, 400)).astype(np.float32)
+    points, chips = many_points()
+    without = chips.chips.copy()
+    without[::2] = 0
+    other = replace(of, image=ArrayImage(noise))
+    context = context_of(other)
+    with pytest.raises(NoConsensus, match="far search does not agree"):
+        search_far(context, points, MemoryChips(without), predicted(other, points), GSD_M)
 
 
 def test_missing_pixels_hide_their_points_alone() -> None:
