@@ -26,6 +26,7 @@ from amers.app.usecases.blocks.quality import (
     write_quality,
 )
 from amers.app.usecases.blocks.stored_quality import assess_stored
+from amers.app.usecases.registration.result_folder import older_result
 from amers.services.formats.block.document_json import BLOCK_JSON
 from amers.services.quality.accuracy_statement import accuracy_document
 from amers.services.quality.block import BlockQuality, Distribution, quality_document
@@ -134,6 +135,8 @@ def quality(
     )
     references = replace(references, sites=sites, heights=heights.files())
     is_folder = (Path(block) / BLOCK_JSON).is_file()
+    if output is not None:
+        older_result(output)
     is_asked = output is not None or (references, required) != (QualityReferences(), RequiredQuality())
     if not (is_folder or is_asked):
         _show_kept(block, as_json=as_json)

@@ -17,7 +17,7 @@ from amers.app.usecases.executors import ComputeOptions, open_executor
 from amers.app.usecases.ground_classes import GroundFiles, read_ground
 from amers.app.usecases.image_selection import ITEMS
 from amers.app.usecases.new_block import BlockIdentity, block_metadata, points_per_km2, refuse_existing
-from amers.app.usecases.registration.result_folder import replacing
+from amers.app.usecases.registration.result_folder import older_result, replacing
 from amers.app.usecases.report_files import write_report
 from amers.services.adjustment.known_images import KnownImages
 from amers.services.errors import FormatError
@@ -95,11 +95,13 @@ def run_image_production(
         progress: receives the fraction done and a message.
 
     Raises:
-        InputError: an image cannot be used, the folder exists, or the work folder is that of another
-            production.
+        InputError: an image cannot be used, the folder exists, the report cannot be written, or the
+            work folder is that of another production.
         ComputationError: the images do not make a block.
     """
     refuse_existing(folder)
+    report_folder = folder.with_name(f"{folder.name}.adjustment")
+    older_result(report_folder)
     with ExitStack() as stack:
         scenes, files = _read(images, stack, part_of(progress, 0.0, 0.05))
         work_folder = place.folder or folder.with_name(f"{folder.name}.work")
@@ -118,6 +120,8 @@ def run_image_production(
         )
         stated = chain(*(scene.statements for scene in scenes), control.statements)
         production = replace(production, statements=gathered(stated))
+        # Before the block, whose folder would refuse the run that makes up for a missing report.
+        _write_report(report_folder, identity.id, production)
         write_block(
             folder,
             _metadata(identity, scenes, production, options, control.neighbour),
@@ -127,7 +131,6 @@ def run_image_production(
             typology=ground.typology(production.points),
             progress=part_of(progress, 0.9, 0.1),
         )
-    _write_report(folder.with_name(f"{folder.name}.adjustment"), identity.id, production)
     if place.folder is None:
         shutil.rmtree(work_folder)
     return production

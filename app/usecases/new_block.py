@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from amers.app.errors import InputError
+from amers.app.usecases.registration.result_folder import older_result
 from amers.services.formats.block.document import (
     AccuracyFigure,
     BlockMetadata,
@@ -45,13 +46,14 @@ class BlockIdentity:
 
 
 def refuse_existing(folder: Path) -> None:
-    """Refuse a folder that exists.
+    """Refuse a folder that exists, or cannot be made, before the work that it is for.
 
     Raises:
-        InputError: it exists.
+        InputError: it exists, or its place cannot be written.
     """
     if folder.exists():
         raise InputError(f"{folder}: already exists; a block is written into a new folder")
+    older_result(folder)
 
 
 def fewest_views(points: ControlPoints) -> int:

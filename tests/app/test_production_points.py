@@ -13,6 +13,9 @@ from pyproj import Transformer
 from rasterio.transform import from_origin
 
 from amers.app.cli.main import main
+from amers.app.errors import InputError
+from amers.app.usecases.image_production import ProductionImages, run_image_production
+from amers.app.usecases.new_block import BlockIdentity
 from amers.services.formats.block.check import check_block
 from amers.services.types import Array
 from tests.services.textures import as_pixels, texture
@@ -167,6 +170,21 @@ def test_an_existing_block_is_not_overwritten(amers, image: Path, tmp_path: Path
     said = amers("points", csv(tmp_path), "--images", image, "-o", tmp_path / "block")
     assert said.returncode == 2
     assert "already exists; a block is written into a new folder" in " ".join(said.stderr.split())
+
+
+def test_what_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
+    """The images do not exist: nothing was read."""
+    (tmp_path / "made.adjustment").write_text("a file in place of the folder of the report")
+    (tmp_path / "other.adjustment" / "report.json").mkdir(parents=True)
+    (tmp_path / "file").touch()
+    images = ProductionImages((tmp_path / "one.tif", tmp_path / "two.tif"))
+    for name, why in (
+        ("made", "made.adjustment: is a file, a folder expected"),
+        ("other", "other.adjustment: contains files, but no manifest.json"),
+        ("file/made", "cannot be written"),
+    ):
+        with pytest.raises(InputError, match=why):
+            run_image_production(images, tmp_path / name, BlockIdentity("made"))
 
 
 @pytest.mark.long

@@ -56,6 +56,24 @@ def make(images: ProductionImages, folder: Path, place: WorkPlace) -> dict[str, 
     return content(folder)
 
 
+def test_a_production_whose_report_was_not_written_goes_on(
+    images: ProductionImages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Somebody puts a file into the place of its report while it works."""
+    folder, module = tmp_path / "block", "amers.app.usecases.image_production"
+    with monkeypatch.context() as patched:
+        patched.setattr(
+            f"{module}.adjustment_report",
+            lambda *_, **__: (tmp_path / "block.adjustment").write_text("of somebody"),
+        )
+        with pytest.raises(InputError, match=r"block\.adjustment: is a file"):
+            make(images, folder, WorkPlace())
+    assert not folder.exists()
+    (tmp_path / "block.adjustment").unlink()
+    make(images, folder, WorkPlace())
+    assert (tmp_path / "block.adjustment" / "report.html").exists()
+
+
 @pytest.fixture(scope="module")
 def block(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of the block made in one process, once there is a `production`."""
