@@ -1,12 +1,12 @@
 """Map grids: conversion between longitude, latitude and the lines and samples of regular pixels."""
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
+from amers.services.datums import from_wgs84, horizontal, to_wgs84
 from amers.services.errors import InputError
 from amers.services.geodesy import longitudes_near, metres_per_degree_at
 from amers.services.types import Array, BoolArray
@@ -36,12 +36,12 @@ class MapGrid:
     @property
     def is_geographic(self) -> bool:
         """Whether the map coordinates are longitude and latitude."""
-        return _horizontal(self.crs).is_geographic
+        return horizontal(self.crs).is_geographic
 
     @property
     def first_axis_is_north(self) -> bool:
         """Whether the reference system has northing or latitude first; `xy` never has."""
-        return _horizontal(self.crs).axis_info[0].direction.lower() == "north"
+        return horizontal(self.crs).axis_info[0].direction.lower() == "north"
 
     @property
     def gsd_m(self) -> float:
@@ -136,12 +136,12 @@ def check_map(crs: str) -> None:
 
 def xy_of_lon_lat(crs: str, lon_lat: Array) -> Array:
     """Map positions (n, 2) of WGS 84 longitudes and latitudes (n, 2); NaN outside the map's domain."""
-    return _transformed(_to_map(crs), lon_lat)
+    return _transformed(from_wgs84(crs), lon_lat)
 
 
 def lon_lat_of_xy(crs: str, xy: Array) -> Array:
     """WGS 84 longitudes (-180 to 180) and latitudes (n, 2) of map positions (n, 2); NaN outside."""
-    lon_lat = _transformed(_from_map(crs), xy)
+    lon_lat = _transformed(to_wgs84(crs), xy)
     lon_lat[:, 0] -= 360.0 * np.floor((lon_lat[:, 0] + 180.0) / 360.0)
     return lon_lat
 
@@ -157,20 +157,3 @@ def _transformed(transformer: Transformer, points: Array) -> Array:
     out = np.column_stack([x, y])
     out[~(np.isfinite(x) & np.isfinite(y))] = np.nan
     return out
-
-
-@cache
-def _horizontal(crs: str) -> CRS:
-    """The horizontal part of a reference system."""
-    parsed = CRS.from_user_input(crs)
-    return parsed.sub_crs_list[0] if parsed.is_compound else parsed.to_2d()
-
-
-@cache
-def _to_map(crs: str) -> Transformer:
-    return Transformer.from_crs("EPSG:4326", _horizontal(crs), always_xy=True)
-
-
-@cache
-def _from_map(crs: str) -> Transformer:
-    return Transformer.from_crs(_horizontal(crs), "EPSG:4326", always_xy=True)

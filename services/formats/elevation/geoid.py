@@ -1,14 +1,13 @@
 """Geoids: heights of vertical datums above the WGS 84 ellipsoid, from grids that PROJ reads."""
 
-import warnings
 from pathlib import Path
 
 import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.crs import CompoundCRS
 from pyproj.exceptions import ProjError
-from pyproj.transformer import TransformerGroup
 
+from amers.services.datums import missing_grids, transformations
 from amers.services.errors import InputError, MissingGeoid, VerticalDatumError
 from amers.services.map_grid import crs_of_code
 from amers.services.terrain import Geoid
@@ -58,39 +57,13 @@ def geoid_of_crs(vertical: CRS) -> Geoid:
         MissingGeoid: PROJ has no transformation to the ellipsoid with an installed grid.
     """
     compound = CompoundCRS("position and height", ["EPSG:4326", vertical])
-    group = _transformations(compound)
+    group = transformations(compound)
     if not group.transformers:
         raise MissingGeoid(
             f"heights in {vertical.name} cannot be converted to heights above the ellipsoid"
             f"{missing_grids(compound)}; or give the grid file of the geoid"
         )
     return _geoid(group.transformers[0])
-
-
-def missing_grids(crs: CRS) -> str:
-    """Which grids PROJ lacks to reach WGS 84 from a CRS, and where they are; "" when it lacks none."""
-    operations = _transformations(crs).unavailable_operations
-    grids = [grid for step in operations for grid in step.grids if not grid.available]
-    published = sorted({grid.short_name for grid in grids if grid.url})
-    names = published or sorted({grid.short_name for grid in grids})
-    if not names:
-        return ""
-    message = f": PROJ has no {' or '.join(names)} installed"
-    if published:
-        message += (
-            f"; the package proj-data of conda-forge has it, or run: pyproj sync --file {names[0]}"
-        )
-    if "us_nga_egm96_15.tif" in names:
-        message += "; proj-data of Debian has it as egm96_15.gtx"
-    return message
-
-
-def _transformations(crs: CRS) -> TransformerGroup:
-    """The transformations to WGS 84 that are not approximate."""
-    with warnings.catch_warnings():
-        # PROJ warns that the best transformation is not installed; the callers handle it.
-        warnings.simplefilter("ignore", UserWarning)
-        return TransformerGroup(crs, "EPSG:4979", always_xy=True, allow_ballpark=False)
 
 
 def vertical_crs(name: str) -> CRS | None:

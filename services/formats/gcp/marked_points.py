@@ -27,11 +27,11 @@ import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
+from amers.services.datums import missing_grids
 from amers.services.errors import FormatError, MissingGeoid, VerticalDatumError
 from amers.services.formats.elevation.geoid import (
     geoid_of_crs,
     geoid_of_grid,
-    missing_grids,
     vertical_crs,
 )
 from amers.services.statements import Statements

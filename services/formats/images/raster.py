@@ -15,6 +15,7 @@ from rasterio.enums import MaskFlags
 from rasterio.errors import NotGeoreferencedWarning
 from rasterio.windows import Window as RasterWindow
 
+from amers.services.datums import DatumShift, datum_shift
 from amers.services.errors import FormatError
 from amers.services.formats.addresses import Address, FilePlace, file_bytes
 from amers.services.formats.images.bands import BandMix, PixelCodes, default_mix, one_band
@@ -185,7 +186,8 @@ def map_grid_of(image: RasterImage) -> MapGrid | None:
     """The map grid of an image; None when the file has no reference system or no geotransform.
 
     Raises:
-        FormatError: the grid is degenerate, or its centre is not on the Earth.
+        FormatError: the grid is degenerate, its centre is not on the Earth, or its reference system has
+            no usable transformation to WGS 84.
     """
     t = image.dataset.transform
     if image.dataset.crs is None or t.is_identity:
@@ -200,13 +202,22 @@ def map_grid_of(image: RasterImage) -> MapGrid | None:
         )
     try:
         centre = grid.lon_lat((np.array([image.shape], dtype=np.float64) - 1.0) / 2.0)
-    except ProjError as error:
-        raise FormatError(
-            f"{image.path}: its reference system cannot be transformed to WGS 84: {error}"
-        ) from error
+    except ProjError:
+        shift_of_grid(image, grid)  # says what is missing
+        raise
     if not np.isfinite(centre).all():
         raise FormatError(f"{image.path}: its centre is not on the Earth in {crs[:60]}…")
     return grid
+
+
+def shift_of_grid(image: RasterImage, grid: MapGrid) -> DatumShift:
+    """The operation that leads from the map of an image to WGS 84, at its centre.
+
+    Raises:
+        FormatError: there is no usable operation.
+    """
+    centre = (np.array([image.shape], dtype=np.float64) - 1.0) / 2.0
+    return datum_shift(grid.crs, grid.xy(centre)[0], str(image.path))
 
 
 def copy_with_rpc(path_in: Path, path_out: Path, model: RpcModel) -> None:

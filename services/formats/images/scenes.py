@@ -12,7 +12,7 @@ from amers.services.errors import FormatError
 from amers.services.formats.addresses import FilePlace
 from amers.services.formats.images.bands import BandMix, PixelCodes
 from amers.services.formats.images.masks import apply_mask
-from amers.services.formats.images.raster import RasterImage, map_grid_of, open_raster
+from amers.services.formats.images.raster import RasterImage, map_grid_of, open_raster, shift_of_grid
 from amers.services.formats.sensor_models.dimap import (
     parse_dimap_acquisition,
     parse_dimap_pixel_codes,
@@ -93,7 +93,7 @@ def read_scene(
         model_path, crop_origin: as for `read_rpc`.
         sigma_m: horizontal accuracy of the model, one standard deviation of each coordinate; by default
             the figure of the producer, else that of the sensor, else 50 m. Required for an ortho-image
-            of an unknown sensor.
+            of an unknown sensor. The accuracy of a datum transformation is added to it.
         bands: the bands to use; by default the panchromatic band or the mean of the visible bands.
         mask: image of the same ground, with the same or coarser pixels, nonzero where pixels are
             excluded.
@@ -113,7 +113,14 @@ def read_scene(
             acquisition = _ortho_acquisition(image)
             if sigma_m is None:
                 sigma_m = _ortho_sigma_m(path, acquisition.sensor)
-            return Scene(_masked(image, mask), OrthoModel(grid), acquisition, sigma_m)
+            shift = shift_of_grid(image, grid)
+            return Scene(
+                _masked(image, mask),
+                OrthoModel(grid),
+                acquisition,
+                math.hypot(sigma_m, shift.sigma_m),
+                statements=(*image.statements, shift.statement(path.name)),
+            )
         alone = rigorous is not None and model_path is None and not has_rpc(image)
         file = rigorous.path if rigorous is not None and alone else model_path
         delivered = model_of_image(image, file, crop_origin)
