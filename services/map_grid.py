@@ -12,6 +12,12 @@ from amers.services.geodesy import longitudes_near, metres_per_degree_at
 from amers.services.types import Array, BoolArray
 
 AUTHORITIES = ("EPSG", "ESRI", "IGNF", "OGC")
+NEARLY_TRUE = 0.01
+"""Largest scale error of a map whose lengths are taken as those of the ground: a step of 0.5 m is then
+0.5 units of the map. Grids of surveys stay far below (UTM: 0.001); the map of the web exceeds it from 8
+degrees of latitude on."""
+_BESIDE_SEAM_DEG = 179.99
+"""Longitude up to which the scale of a map is taken: most maps of the world end at 180 degrees."""
 _DIFFERENCE_M = 50.0
 """Half the length of the central differences of a derivative. Their relative error is the square of this
 length over the radius of the Earth, 1e-10."""
@@ -139,11 +145,47 @@ def xy_of_lon_lat(crs: str, lon_lat: Array) -> Array:
     return _transformed(from_wgs84(crs), lon_lat)
 
 
+def continuous_xy(crs: str, lon_lat: Array) -> Array:
+    """Map positions (n, 2) of continuous longitudes and latitudes (n, 2), as `xy_of_lon_lat`.
+
+    On a geographic map they are continuous, too: they may exceed a half turn.
+    """
+    xy, horizontal = xy_of_lon_lat(crs, lon_lat), _horizontal(crs)
+    if horizontal.is_geographic and len(xy):
+        degree = np.radians(1.0) / float(horizontal.axis_info[0].unit_conversion_factor)
+        beyond = xy[:, 0] - xy[0, 0] - (lon_lat[:, 0] - lon_lat[0, 0]) * degree
+        xy[:, 0] -= 360.0 * degree * np.round(beyond / (360.0 * degree))
+    return xy
+
+
 def lon_lat_of_xy(crs: str, xy: Array) -> Array:
     """WGS 84 longitudes (-180 to 180) and latitudes (n, 2) of map positions (n, 2); NaN outside."""
     lon_lat = _transformed(to_wgs84(crs), xy)
     lon_lat[:, 0] -= 360.0 * np.floor((lon_lat[:, 0] + 180.0) / 360.0)
     return lon_lat
+
+
+def map_units_per_metre(crs: str, lon_lat: Array) -> Array:
+    """Units of a map in one metre of the ground at a place: the only conversion of `gsd_m` to a map.
+
+    Args:
+        crs: reference system of the map, WKT or a code: its unit may be a metre, a foot or a degree.
+        lon_lat: (2,) the place, whose longitude may exceed a half turn.
+
+    Returns:
+        (2,) along x and along y. On a projected map both are the same, the root of the ratio of areas;
+        within `NEARLY_TRUE` they are those of its unit alone. NaN outside the map's domain.
+    """
+    grid = MapGrid(crs, np.zeros(2), np.array([[0.0, 1.0], [-1.0, 0.0]]), (1, 1))
+    lon = float(np.clip((lon_lat[0] + 180.0) % 360.0 - 180.0, -_BESIDE_SEAM_DEG, _BESIDE_SEAM_DEG))
+    line, sample = grid.derivative(np.array([[lon, lon_lat[1], 0.0]]))[0]
+    of_ground = np.array([sample, -line])
+    if grid.is_geographic:
+        return np.asarray(1.0 / np.linalg.norm(np.linalg.inv(of_ground), axis=0))
+    in_true_metre = 1.0 / float(_horizontal(crs).axis_info[0].unit_conversion_factor)
+    per_metre = float(abs(np.linalg.det(of_ground))) ** 0.5
+    is_true = abs(per_metre / in_true_metre - 1.0) <= NEARLY_TRUE
+    return np.full(2, in_true_metre if is_true else per_metre)
 
 
 def utm_of(lon: float, lat: float) -> str:

@@ -1,8 +1,9 @@
 """Orthorectify a scene through its model and a terrain: for the command line, and as a process."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -36,6 +37,7 @@ from amers.app.usecases.scene_inputs import (
 )
 from amers.app.usecases.scenes import local_image, stored_keys
 from amers.app.usecases.terrain_file import TerrainFile, read_terrain
+from amers.services.errors import CoverageError
 from amers.services.formats.elevation.geoid import vertical_crs
 from amers.services.formats.images.bands import one_band
 from amers.services.formats.images.ortho import write_cog
@@ -48,6 +50,7 @@ from amers.services.orthorectification.rectify import (
     OrthoWindow,
     choose_grid,
     orthorectify,
+    unseen,
 )
 from amers.services.statements import Statements, gathered
 from amers.services.types import Progress, no_progress
@@ -156,7 +159,7 @@ class MapLimits:
             InputError: the map is finer than the scene, or larger.
             TooLarge: the map does not fit into what is left of the quota.
         """
-        require_warranted_gsd(_ground_sampling_m(grid), scene_gsd_m(scene))
+        require_warranted_gsd(grid.gsd_m, scene_gsd_m(scene))
         lines, samples = grid.shape
         most = MOST_MAP_PIXELS * math.prod(scene.image.shape)
         if lines * samples > most:
@@ -219,7 +222,7 @@ def run_orthorectification(
         progress: receives the fraction done and a message.
 
     Raises:
-        InputError: the scene or the terrain cannot be used.
+        InputError: the scene or the terrain cannot be used, or no pixel of the map shows the scene.
         ComputationError: the mapping exceeds the tolerance.
     """
     _check_request(ortho_map, output, (image, terrain.dem))
@@ -232,7 +235,7 @@ def run_orthorectification(
     dtype, nodata = _pixel_type(raster)
     if limits is not None:
         limits.check(scene, grid, len(bands) * np.dtype(dtype).itemsize)
-    counter = _DataPixels()
+    counter = _DataPixels(partial(unseen, scene, ground))
     windows = counter.count(orthorectify(bands, scene.model, ground, grid, options, progress=progress))
     saturated = next(reversed(raster.saturated_values(1)), None)
     error_px = write_cog(
@@ -246,7 +249,7 @@ def run_orthorectification(
         lines=lines,
         samples=samples,
         bands=len(bands),
-        gsd_m=_ground_sampling_m(grid),
+        gsd_m=grid.gsd_m,
         seen=counter.pixels / (lines * samples * len(bands)),
         error_px=error_px,
         vertical=ground.vertical,
@@ -273,21 +276,19 @@ def _pixel_type(raster: RasterImage) -> tuple[str, float]:
     return dtype, float(nodata)
 
 
-def _ground_sampling_m(grid: MapGrid) -> float:
-    """The side of a square as large as a pixel: on a projected map in its metres, else on the ground."""
-    return grid.gsd_m if grid.is_geographic else float(abs(np.linalg.det(grid.step_xy))) ** 0.5
-
-
 @dataclass
 class _DataPixels:
-    """Counts the pixels with data of windows on their way into the file."""
+    """Counts the pixels with data of windows on their way into the file: none at all is an error."""
 
+    of_none: Callable[[], CoverageError]
     pixels: int = 0
 
     def count(self, windows: Iterator[OrthoWindow]) -> Iterator[OrthoWindow]:
         for window in windows:
             self.pixels += int((~np.isnan(window.pixels)).sum())
             yield window
+        if self.pixels == 0:
+            raise self.of_none()
 
 
 def _data_bands(image: RasterImage) -> list[int]:

@@ -9,11 +9,10 @@ import numpy as np
 from numba import njit
 
 from amers.services.errors import CoverageError, InputError
-from amers.services.geodesy import metres_per_degree
 from amers.services.imagery.gaps import LOST_SHARE
-from amers.services.imagery.scene import Scene, scene_gsd_m
+from amers.services.imagery.scene import Scene, scene_footprint, scene_gsd_m
 from amers.services.imagery.source import ImageSource, Window, block_means, low_pass
-from amers.services.map_grid import MapGrid, check_map_code, utm_of, xy_of_lon_lat
+from amers.services.map_grid import MapGrid, check_map_code, continuous_xy, map_units_per_metre, utm_of
 from amers.services.orthorectification.mapping import map_into_image, occluded_ground
 from amers.services.sensors.base import SensorModel
 from amers.services.terrain import Terrain
@@ -80,8 +79,9 @@ def choose_grid(
         scene: with the model to be used.
         terrain: the ground.
         crs: reference system of the map; by default the UTM zone of the centre.
-        gsd_m: ground sampling, metres; by default that of the scene. Pixel corners lie on multiples of
-            it. On a geographic map a pixel has this side both east and north, at the mean latitude.
+        gsd_m: ground sampling, metres on the ground whatever the unit and the scale of the map; by
+            default that of the scene. Pixel corners lie on multiples of it. On a geographic map a pixel
+            has this side both east and north, at the mean latitude.
 
     Raises:
         CoverageError: the terrain does not reach the scene.
@@ -96,23 +96,19 @@ def choose_grid(
     lon_lat = _located(scene.model, positions, around.range_m())
     lon_lat = lon_lat[np.isfinite(lon_lat).all(axis=1)]
     if not len(lon_lat):
-        raise CoverageError(
-            "the model of the scene locates none of its pixels at the heights of the terrain: check "
-            "that the image, the model and the terrain belong together"
-        )
+        raise unseen(scene, around)
     lon_lat[:, 0] = lon_lat[0, 0] + (lon_lat[:, 0] - lon_lat[0, 0] + 180.0) % 360.0 - 180.0
     lon, lat = lon_lat.mean(axis=0)
     crs = crs or utm_of((lon + 180.0) % 360.0 - 180.0, lat)
-    empty = MapGrid(crs, np.zeros(2), np.array([[0.0, 1.0], [-1.0, 0.0]]), (1, 1))
-    xy = lon_lat if empty.is_geographic else xy_of_lon_lat(crs, lon_lat)
+    xy = continuous_xy(crs, lon_lat)
     xy = xy[np.isfinite(xy).all(axis=1)]
     if not len(xy):
         raise InputError(
             f"{crs}: the scene at longitude {lon:.3f}, latitude {lat:.3f} is outside this reference "
             "system. Choose another one"
         )
-    unit_m = np.array(metres_per_degree(lat, 0.0) if empty.is_geographic else (1.0, 1.0))
-    step = (gsd_m or scene_gsd_m(scene)) / unit_m
+    per_metre = map_units_per_metre(crs, np.array([lon, lat]))
+    step = (gsd_m or scene_gsd_m(scene)) * per_metre
     first, last = np.floor(xy.min(axis=0) / step), np.ceil(xy.max(axis=0) / step)
     samples, lines = (int(count) for count in last - first)
     if lines * samples > _MAX_MAP_PIXELS:
@@ -122,6 +118,20 @@ def choose_grid(
         )
     origin = np.array([first[0] + 0.5, last[1] - 0.5]) * step
     return MapGrid(crs, origin, np.array([[0.0, step[0]], [-step[1], 0.0]]), (lines, samples))
+
+
+def unseen(scene: Scene, terrain: Terrain) -> CoverageError:
+    """Why no ground of a terrain is seen in a scene, and what to do."""
+    low_m, high_m = scene.model.height_range_m
+    lowest_m, highest_m = terrain.around(scene_footprint(scene)).range_m()
+    why = "all pixels that the map reaches are without data, or the terrain is void there"
+    if lowest_m > high_m or highest_m < low_m:
+        why = (
+            f"its model is valid for heights of {low_m:.0f} to {high_m:.0f} m above the ellipsoid, the "
+            f"terrain there has {lowest_m:.0f} to {highest_m:.0f} m: give the model that was delivered "
+            "with the image, or check the vertical datum and the unit of the terrain"
+        )
+    return CoverageError(f"{scene.acquisition.image_id}: no pixel of the map shows the scene: {why}")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 from amers.services.errors import InputError
 from amers.services.geodesy import WGS84_A, longitudes_near
 from amers.services.imagery.scene import Scene, scene_footprint, scene_gsd_m
-from amers.services.map_grid import MapGrid
+from amers.services.map_grid import MapGrid, map_units_per_metre
 from amers.services.types import Array
 
 TILE_PX = 256
@@ -116,7 +116,7 @@ def choose_tiles(scenes: Sequence[Scene], heights_m: tuple[float, float]) -> lis
             f"the scene reaches latitude {lat:.2f} degrees; the map of the web ends at "
             f"{_MOST_LATITUDE_DEG:g} degrees"
         )
-    step_m = scene_gsd_m(scene) / math.cos(math.radians(float(lon_lat[:, 1].mean())))
+    step_m = scene_gsd_m(scene) * float(map_units_per_metre(_CRS, lon_lat.mean(axis=0))[0])
     zoom = min(max(round(math.log2(_step_m(0) / step_m)), 0), MOST_ZOOM)
     finest = _limits(lon_lat, zoom)
     most_tiles = _MOST_MAP_PIXELS * math.prod(scene.image.shape) / TILE_PX**2

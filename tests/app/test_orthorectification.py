@@ -20,7 +20,7 @@ from amers.app.config import Settings
 from amers.app.db import engine, scenes
 from amers.app.db.engine import Database
 from amers.app.db.jobs import jobs
-from amers.app.errors import AmersError
+from amers.app.errors import AmersError, InputError
 from amers.app.storage import Storage
 from amers.app.usecases.jobs import do_attempt
 from amers.services.formats.images.raster import write_raster
@@ -110,6 +110,26 @@ def test_the_ground_sampling_of_a_map_in_degrees_is_that_of_its_pixels_on_the_gr
     assert made["gsd_m"] == pytest.approx(pixel_m2**0.5, rel=a_thousandth)
 
 
+def test_a_map_in_links_has_the_metres_that_were_asked_for(tmp_path: Path) -> None:
+    """A link is 0.2 m."""
+    image, dem = write_inputs(tmp_path)
+    words = ("--dem", dem, "--vertical", "ellipsoid", "--gsd-m", 2, "--crs", "EPSG:30200")
+    assert ortho(image, *words, "-o", tmp_path / "ortho.tif")["gsd_m"] == pytest.approx(2.0, rel=0.01)
+
+
+def test_a_scene_that_no_pixel_shows_leaves_the_older_file_and_says_why(tmp_path: Path) -> None:
+    image, dem = write_inputs(tmp_path)
+    write_raster(image, np.zeros((300, 400), np.uint16), in_the_image())
+    with rasterio.open(image, "r+", IGNORE_COG_LAYOUT_BREAK="YES") as file:
+        file.nodata = 0
+    (tmp_path / "ortho.tif").write_text("older")
+    words = ("--dem", dem, "--vertical", "ellipsoid", "-o", tmp_path / "ortho.tif")
+    with pytest.raises(InputError, match="no pixel of the map shows the scene: all pixels"):
+        ortho(image, *words)
+    assert (tmp_path / "ortho.tif").read_text() == "older"
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.tif", "dem.tif", "ortho.tif"}
+
+
 def test_heights_without_a_datum_and_outputs_over_inputs_are_refused(tmp_path: Path) -> None:
     scene, dem = write_inputs(tmp_path)
     with pytest.raises(AmersError, match=r"dem\.tif.*does not state its vertical datum"):
@@ -184,8 +204,7 @@ def test_a_service_rectifies_a_scene_on_a_terrain_uploaded_beside_it(
     ("ortho_map", "quota_bytes", "error", "named"),
     [
         ({"gsd_m": 0.05}, None, "InputError", "a finer map shows no more"),
-        # A grid in links of 0.2 m: a step of as many units as the scene has metres is too small.
-        ({"crs": "EPSG:30200"}, None, "InputError", "16 times the pixels of the scene"),
+        ({"gsd_m": 0.26}, None, "InputError", "3 times the pixels of the scene"),
         ({}, 300_000, "TooLarge", "left of the storage quota"),
     ],
 )
@@ -200,7 +219,10 @@ def test_a_job_makes_no_map_that_its_scene_and_quota_do_not_warrant(
     storage: Storage,
     database: Database,
     tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """Most maps with more than 16 times the pixels of their scene are finer than that; so 3 here."""
+    monkeypatch.setattr("amers.app.usecases.orthorectification.MOST_MAP_PIXELS", 3)
     image, dem = write_inputs(tmp_path)
     me = make_token(client, bearer("admin"), storage_quota_bytes=quota_bytes)
     scene = me.scene(image.read_bytes())

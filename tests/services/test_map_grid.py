@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pyproj import Geod
 from rasterio.transform import Affine
 from rasterio.warp import transform
 
 from amers.services.errors import InputError
 from amers.services.geodesy import east_north_up
-from amers.services.map_grid import MapGrid, check_map_code, utm_of
+from amers.services.map_grid import MapGrid, check_map_code, map_units_per_metre, utm_of, xy_of_lon_lat
 
 a_micropixel = 1e-6
 a_millionth = 1e-6
@@ -155,3 +156,55 @@ def test_codes_of_maps_on_the_earth_are_accepted(code: str) -> None:
 def test_codes_of_something_else_are_refused(code: str, why: str) -> None:
     with pytest.raises(InputError, match=why):
         check_map_code(code)
+
+
+@pytest.mark.parametrize(
+    ("crs", "lon", "lat"),
+    [
+        ("EPSG:32618", -73.95, 40.69),
+        ("EPSG:2263", -73.95, 40.69),  # US survey feet
+        ("EPSG:6539", -73.95, 40.69),  # US survey feet, NAD83(2011)
+        ("EPSG:2223", -110.5, 33.0),  # international feet
+        ("EPSG:2314", -61.3, 10.4),  # Clarke's feet
+        ("EPSG:24600", 47.9, 29.3),  # metres
+        ("EPSG:3857", -73.95, 40.69),
+        ("EPSG:3857", 20.0, -65.0),
+        ("EPSG:3857", 20.0, 1.0),
+        ("EPSG:3857", 180.0, -16.0),
+        ("EPSG:3857", 180.0002, -16.0),
+        ("EPSG:3395", 20.0, 60.0),
+        ("EPSG:3031", 60.0, -80.0),
+        ("EPSG:3035", -9.0, 38.7),
+        ("EPSG:4326", 5.2, 44.2),
+        ("EPSG:4326", 5.2, -70.0),
+        ("EPSG:4267", -90.0, 40.0),
+        ("EPSG:4807", 5.2, 44.2),  # grads from Paris
+        ("EPSG:27572", 5.2, 44.2),  # metres, grads from Paris below
+    ],
+)
+def test_a_metre_of_the_ground_is_a_metre_in_every_unit_and_scale(
+    crs: str, lon: float, lat: float
+) -> None:
+    """Ten metres by the geodesic, against the same in units of the map."""
+    per_metre = map_units_per_metre(crs, np.array([lon, lat]))
+    lon = min(lon, 179.9)
+    place = np.array([lon, lat])
+    east, north, _ = zip(
+        *(Geod(ellps="WGS84").fwd(lon, lat, way, 10.0) for way in (90.0, 0.0)), strict=True
+    )
+    x, y = xy_of_lon_lat(crs, np.array([place, *zip(east, north, strict=True)])).T
+    moved = np.array([[x[1] - x[0], x[2] - x[0]], [y[1] - y[0], y[2] - y[0]]]) / 10.0
+    if crs in ("EPSG:4326", "EPSG:4267", "EPSG:4807"):
+        np.testing.assert_allclose(per_metre, np.diag(moved), rtol=1e-3)
+    else:
+        assert per_metre[0] == per_metre[1]
+        assert per_metre[0] == pytest.approx(np.sqrt(abs(np.linalg.det(moved))), rel=0.01)
+
+
+def test_steps_of_maps_that_are_nearly_true_are_round_numbers_of_their_unit() -> None:
+    us_survey_foot_m = 1200.0 / 3937.0
+    place = np.array([-73.95, 40.69])
+    assert map_units_per_metre("EPSG:32618", place).tolist() == [1.0, 1.0]
+    np.testing.assert_allclose(
+        map_units_per_metre("EPSG:2263", place), 1.0 / us_survey_foot_m, rtol=1e-9
+    )

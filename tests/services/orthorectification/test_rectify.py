@@ -327,6 +327,17 @@ def test_terrain_of_another_place_is_refused() -> None:
         choose_grid(scene(), far)
 
 
+def test_a_map_without_a_pixel_of_the_scene_says_which_heights_do_not_fit() -> None:
+    """A model that is valid for 2 m of height, and ground 50 m below."""
+    of = scene()
+    flat = replace(of.model, ground_offset=np.array([*of.model.ground_offset[:2], 900.0]))
+    flat = replace(flat, ground_scale=np.array([*flat.ground_scale[:2], 1.0]))
+    with pytest.raises(
+        CoverageError, match=r"valid for heights of 899 to 901 m .* has 5\d\d to 8\d\d m"
+    ):
+        choose_grid(replace(of, model=flat), terrain())
+
+
 def test_an_ortho_image_is_a_cloud_optimised_geotiff_with_overviews(tmp_path: Path) -> None:
     ground = terrain()
     grid = choose_grid(scene(), ground)
@@ -407,7 +418,7 @@ def test_a_coarse_map_shows_the_image_as_blurred_as_its_pixels_are_large(gsd_m: 
     assert area.std() == pytest.approx(expected_std, rel=0.25)
 
 
-@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:32631"])
+@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:32631", "EPSG:3857", "EPSG:4807", "EPSG:27572"])
 def test_pixels_of_a_map_are_as_long_as_wide_on_the_ground(crs: str) -> None:
     grid = choose_grid(scene(), terrain(), crs, gsd_m=3.0)
     corner, right, down = grid.lon_lat(np.array([[80.0, 80.0], [80.0, 81.0], [81.0, 80.0]]))
