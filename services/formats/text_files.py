@@ -1,9 +1,10 @@
-"""Contents of small text files: text, decimal numbers, JSON."""
+"""Contents of small text files: text, decimal numbers, JSON, XML."""
 
 import json
 import re
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 from amers.services.errors import FormatError
 from amers.services.formats.addresses import Address, FilePlace
@@ -60,3 +61,17 @@ def load_json(text: str, source: str) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise FormatError(f"{source}: expected a JSON document: {error}") from None
+
+
+def parse_xml(text: str, source: str) -> ElementTree.Element:
+    """The root of an XML document without a document type, hence without entities of its own.
+
+    Raises:
+        FormatError: it is not such a document.
+    """
+    if "<!DOCTYPE" in text:
+        raise FormatError(f"{source}: <!DOCTYPE found, a document without a document type expected")
+    try:
+        return ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise FormatError(f"{source}: expected a well-formed XML document: {error}") from None

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from amers.services.errors import FormatError
-from amers.services.formats.images.raster import RasterImage, open_raster
+from amers.services.formats.images.raster import OpenImage, RasterImage, open_raster
 from amers.services.imagery.source import Window
 from amers.services.types import FloatImage
 
@@ -23,7 +23,7 @@ class MaskedImage:
         mask: nonzero where pixels are excluded; covers the same ground, with the same or other pixels.
     """
 
-    image: RasterImage
+    image: OpenImage
     mask: RasterImage
 
     @property
@@ -51,7 +51,7 @@ class MaskedImage:
         return pixels
 
 
-def apply_mask(image: RasterImage, mask: Path) -> MaskedImage:
+def apply_mask(image: OpenImage, mask: Path) -> MaskedImage:
     """The image without the pixels that a mask file excludes.
 
     Args:

@@ -4,7 +4,7 @@ import shutil
 import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -25,8 +25,9 @@ from amers.services.formats.images.datasets import (
     as_format_error,
     open_dataset,
 )
+from amers.services.formats.images.georeference import georeference
 from amers.services.formats.images.working_copy import Pixels, open_pixels
-from amers.services.imagery.source import Window
+from amers.services.imagery.source import ImageSource, Window
 from amers.services.map_grid import MapGrid
 from amers.services.sensors.rpc import RpcModel
 from amers.services.statements import Statements
@@ -41,6 +42,24 @@ MAX_PIXELS = 40_000_000_000
 """Largest number of pixels of an image: twice a strip of 40,000 samples and 500,000 lines."""
 MAX_EXPANSION = 5_000
 """Largest ratio of pixel bytes to file bytes: Deflate reaches 1,032 on a constant image."""
+
+
+class OpenImage(ImageSource, Protocol):
+    """An image in one or several opened files."""
+
+    @property
+    def path(self) -> FilePlace:
+        """Of the file, or of the document that lists the files."""
+        ...
+
+    @property
+    def dataset(self) -> rasterio.DatasetReader:
+        """Of the file, or of the first of the files."""
+        ...
+
+    def close(self) -> None:
+        """Close all files."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -96,6 +115,10 @@ class RasterImage:
     def close(self) -> None:
         """Close the file; it cannot be read afterwards."""
         self.pixels.close()
+
+    def with_codes(self, codes: PixelCodes) -> "RasterImage":
+        """The image with other statements of its product about its pixels."""
+        return replace(self, codes=codes)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """In another process the file is opened again."""
@@ -182,17 +205,18 @@ def _opened_again(path: FilePlace, mix: BandMix, codes: PixelCodes) -> RasterIma
     return replace(open_raster(path, mix), codes=codes)
 
 
-def map_grid_of(image: RasterImage) -> MapGrid | None:
-    """The map grid of an image; None when the file has no reference system or no geotransform.
+def map_grid_of(image: OpenImage) -> MapGrid | None:
+    """The map grid of an image, of its own or of a file beside it; None when none states it.
 
     Raises:
         FormatError: the grid is degenerate, its centre is not on the Earth, or its reference system has
             no usable transformation to WGS 84.
     """
-    t = image.dataset.transform
-    if image.dataset.crs is None or t.is_identity:
+    stated = georeference(image.path, image.dataset)
+    t = stated.transform
+    if stated.crs is None or t.is_identity:
         return None
-    crs = image.dataset.crs.to_wkt(version="WKT2_2019")
+    crs = stated.crs.to_wkt(version="WKT2_2019")
     step_xy = np.array([[t.b, t.a], [t.e, t.d]])
     origin_xy = np.array([t.c, t.f]) + step_xy @ [GDAL_FIRST_PIXEL, GDAL_FIRST_PIXEL]
     grid = MapGrid(crs, origin_xy, step_xy, image.shape)
@@ -210,7 +234,7 @@ def map_grid_of(image: RasterImage) -> MapGrid | None:
     return grid
 
 
-def shift_of_grid(image: RasterImage, grid: MapGrid) -> DatumShift:
+def shift_of_grid(image: OpenImage, grid: MapGrid) -> DatumShift:
     """The operation that leads from the map of an image to WGS 84, at its centre.
 
     Raises:

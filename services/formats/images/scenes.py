@@ -11,23 +11,30 @@ import numpy as np
 from amers.services.errors import FormatError
 from amers.services.formats.addresses import FilePlace
 from amers.services.formats.images.bands import BandMix, PixelCodes
+from amers.services.formats.images.georeference import georeference
 from amers.services.formats.images.masks import apply_mask
-from amers.services.formats.images.raster import RasterImage, map_grid_of, open_raster, shift_of_grid
+from amers.services.formats.images.raster import map_grid_of, shift_of_grid
+from amers.services.formats.images.siblings import Siblings
+from amers.services.formats.images.tiled_image import SceneImage, TiledImage
 from amers.services.formats.sensor_models.dimap import (
     parse_dimap_acquisition,
     parse_dimap_pixel_codes,
     parse_imaging_time,
 )
 from amers.services.formats.sensor_models.geom import parse_geom_acquisition
+from amers.services.formats.sensor_models.product_image import open_image
 from amers.services.formats.sensor_models.rigorous_files import rigorous_model_of_image
 from amers.services.formats.sensor_models.rpc_files import DeliveredModel, has_rpc, model_of_image
 from amers.services.formats.sensor_models.rpc_text import rpb_satellite
-from amers.services.formats.text_files import read_text
+from amers.services.formats.sensor_models.worldview_isd import parse_isd_acquisition
+from amers.services.formats.text_files import parse_xml, read_text
 from amers.services.imagery.scene import Scene, view_direction
 from amers.services.imagery.source import ImageSource
+from amers.services.map_grid import MapGrid
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.sensors.parameter_sets import ParameterSet
 from amers.services.sensors.rpc import RpcModel
+from amers.services.statements import Statement, Statements, Subject, Use
 from amers.services.types import Acquisition, Array
 
 CE90_TO_SIGMA = 1.0 / math.sqrt(2.0 * math.log(10.0))
@@ -103,40 +110,86 @@ def read_scene(
     Raises:
         FormatError: the image, its model or its mask cannot be used.
     """
-    image = open_raster(path, bands)
+    image = open_image(path, bands)
+    siblings = Siblings(image.path)
     try:
         rigorous = None
         if parameter_set is not None:
             rigorous = rigorous_model_of_image(image, model_path, crop_origin)
         grid = map_grid_of(image) if rigorous is None else None
-        if grid is not None and model_path is None and crop_origin is None and not has_rpc(image):
-            acquisition = _ortho_acquisition(image)
-            if sigma_m is None:
-                sigma_m = _ortho_sigma_m(path, acquisition.sensor)
-            shift = shift_of_grid(image, grid)
-            return Scene(
-                _masked(image, mask),
-                OrthoModel(grid),
-                acquisition,
-                math.hypot(sigma_m, shift.sigma_m),
-                statements=(*image.statements, shift.statement(path.name)),
-            )
-        alone = rigorous is not None and model_path is None and not has_rpc(image)
+        has_model = model_path is not None or crop_origin is not None or has_rpc(image, siblings)
+        if grid is not None and not has_model:
+            return _ortho_scene(image, grid, sigma_m, mask)
+        alone = rigorous is not None and not has_model
         file = rigorous.path if rigorous is not None and alone else model_path
-        delivered = model_of_image(image, file, crop_origin)
+        delivered = model_of_image(image, file, crop_origin, siblings)
         acquisition = _acquisition(image, delivered)
-        source = _masked(replace(image, codes=_pixel_codes(delivered)), mask)
+        source = _masked(image.with_codes(_pixel_codes(delivered)), mask)
     except FormatError:
         image.close()
         raise
     if sigma_m is None:
         sigma_m = prior_sigma_m(delivered.model, acquisition.sensor)
+    statements = (*image.statements, *delivered.statements, *_unused_grid(image, delivered))
     if rigorous is None:
-        return Scene(source, delivered.model, acquisition, sigma_m)
+        return Scene(source, delivered.model, acquisition, sigma_m, statements=statements)
     model = rigorous.model
     if delivered.convention != "rigorous":
         model = replace(model, height_range_m=delivered.model.height_range_m)
-    return Scene(source, model, acquisition, sigma_m, parameter_set)
+    used = Statement(rigorous.path.name, Subject.MODEL, Use.USED, "rigorous sensor model")
+    return Scene(source, model, acquisition, sigma_m, parameter_set, (used, *statements))
+
+
+def scene_name(path: FilePlace) -> str:
+    """The name of a scene: that of its file; where all files are called alike, that of its product.
+
+    The images of SPOT 1 to 5 are all called `IMAGERY.TIF`, and their documents `METADATA.DIM`: the
+    document has the name of the product, else the folder has one.
+
+    Args:
+        path: of its image, of the document of its product, or of a folder.
+    """
+    if path.stem.upper() not in ("IMAGERY", "METADATA"):
+        return path.stem
+    found = Siblings(path).named(["METADATA.DIM"])
+    try:
+        root = parse_xml(read_text(found[0]), found[0].name) if found else None
+    except FormatError:
+        root = None
+    elements = ("DATASET_NAME", "SOURCE_ID", "JOB_ID")
+    stated = [] if root is None else [root.findtext(f".//{element}", "") for element in elements]
+    names = [re.sub(r"\W+", "_", name.strip()).strip("_")[:100] for name in stated]
+    if any(names):
+        return next(name for name in names if name)
+    return path.resolve().parent.name if isinstance(path, Path) else path.stem
+
+
+def _ortho_scene(image: SceneImage, grid: MapGrid, sigma_m: float | None, mask: Path | None) -> Scene:
+    acquisition = _ortho_acquisition(image)
+    if sigma_m is None:
+        sigma_m = _ortho_sigma_m(image.path, acquisition.sensor)
+    shift = shift_of_grid(image, grid)
+    stated = georeference(image.path, image.dataset).statements
+    return Scene(
+        _masked(image, mask),
+        OrthoModel(grid),
+        acquisition,
+        math.hypot(sigma_m, shift.sigma_m),
+        statements=(*image.statements, *stated, shift.statement(image.path.name)),
+    )
+
+
+def _unused_grid(image: SceneImage, delivered: DeliveredModel) -> Statements:
+    """The map grid of an image whose sensor model is used."""
+    stated = georeference(image.path, image.dataset)
+    is_place = delivered.place is not None or any(
+        statement.subject is Subject.PLACE for statement in delivered.statements
+    )
+    if stated.transform.is_identity or (stated.crs is None and is_place):
+        return ()
+    crs = "without a reference system" if stated.crs is None else f"in {stated.crs.to_string()[:40]}"
+    note = f"{delivered.found.name} is used"
+    return (Statement(image.path.name, Subject.PLACE, Use.NOT_USED, f"map grid {crs}", note=note),)
 
 
 def model_files(path: Path, model_path: Path | None = None) -> list[Path]:
@@ -145,7 +198,7 @@ def model_files(path: Path, model_path: Path | None = None) -> list[Path]:
     Raises:
         FormatError: the image has no usable model.
     """
-    image = open_raster(path)
+    image = open_image(path)
     try:
         if model_path is None and map_grid_of(image) is not None and not has_rpc(image):
             return []
@@ -153,7 +206,12 @@ def model_files(path: Path, model_path: Path | None = None) -> list[Path]:
     finally:
         image.close()
     product = delivered.path.with_name(_product_name(delivered.path))
-    candidates = dict.fromkeys([delivered.path, product])
+    documents: list[FilePlace] = []
+    if isinstance(image, TiledImage):
+        documents = [image.path, *(tile.path for tile in image.tiles)]
+    elif delivered.place is not None and delivered.place.file:
+        documents = [image.path.with_name(delivered.place.file)]
+    candidates = dict.fromkeys([delivered.path, product, *documents])
     beside = [file for file in candidates if isinstance(file, Path) and file.is_file()]
     return [file for file in beside if file.resolve() != path.resolve()]
 
@@ -173,7 +231,7 @@ def prior_sigma_m(model: RpcModel, sensor: str) -> float:
     return UNKNOWN_SIGMA_M
 
 
-def _masked(image: RasterImage, mask: Path | None) -> ImageSource:
+def _masked(image: SceneImage, mask: Path | None) -> ImageSource:
     return image if mask is None else apply_mask(image, mask)
 
 
@@ -185,15 +243,17 @@ def _pixel_codes(delivered: DeliveredModel) -> PixelCodes:
     return parse_dimap_pixel_codes(read_text(product), product.name)
 
 
-def _acquisition(image: RasterImage, delivered: DeliveredModel) -> Acquisition:
+def _acquisition(image: SceneImage, delivered: DeliveredModel) -> Acquisition:
     """Sensor, time and sun from the files, with the viewing direction from the model."""
-    image_id = image.path.stem
+    image_id = scene_name(image.path)
     acquisition = Acquisition(image_id)
     if delivered.convention == "dimap":
         acquisition = _dimap_acquisition(delivered.path, image_id)
     elif delivered.convention == "rpb":
         sensor = rpb_satellite(read_text(delivered.path))
         acquisition = Acquisition(image_id, sensor, _imd_time(delivered.path))
+    elif delivered.convention == "isd":
+        acquisition = parse_isd_acquisition(read_text(delivered.path), image_id, delivered.path.name)
     elif delivered.convention == "geom":
         acquisition = parse_geom_acquisition(read_text(delivered.path), image_id, delivered.path.name)
     if not acquisition.sensor:
@@ -214,7 +274,7 @@ def _imd_time(model: FilePlace) -> datetime | None:
     return None if match is None else parse_imaging_time(*match.groups())
 
 
-def _nitf_time(image: RasterImage) -> datetime | None:
+def _nitf_time(image: SceneImage) -> datetime | None:
     """The time in the image header of a NITF file; unknown digits are hyphens, and then it is None."""
     match = _TIME_OF_DIGITS.fullmatch(image.dataset.tags().get("NITF_IDATIM", ""))
     if match is None:
@@ -222,7 +282,7 @@ def _nitf_time(image: RasterImage) -> datetime | None:
     return parse_imaging_time("-".join(match.group(1, 2, 3)), ":".join(match.group(4, 5, 6)))
 
 
-def _ortho_acquisition(image: RasterImage) -> Acquisition:
+def _ortho_acquisition(image: SceneImage) -> Acquisition:
     """Sensor and time from the file name of an ortho-image, with a vertical viewing direction."""
     name = image.path.stem
     sensor = ""

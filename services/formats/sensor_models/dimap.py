@@ -16,8 +16,8 @@ import numpy as np
 from amers.services.errors import FormatError
 from amers.services.formats.images.bands import PixelCodes
 from amers.services.formats.sensor_models.rpc_text import rpc_from_numbers
-from amers.services.formats.sensor_models.xml_values import parse_xml, single
-from amers.services.formats.text_files import parse_number
+from amers.services.formats.sensor_models.xml_values import single
+from amers.services.formats.text_files import parse_number, parse_xml
 from amers.services.sensors.rpc import RpcModel
 from amers.services.sensors.rpc_fit import fit_to_ground
 from amers.services.types import Acquisition, Array

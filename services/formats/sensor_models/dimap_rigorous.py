@@ -10,11 +10,11 @@ from amers.services.formats.sensor_models.xml_values import (
     midnight_before,
     number,
     numbers,
-    parse_xml,
     seconds,
     single,
     whole_number,
 )
+from amers.services.formats.text_files import parse_xml
 from amers.services.sensors.attitude import interpolated_attitude
 from amers.services.sensors.piecewise import (
     LAGRANGE_NODES,

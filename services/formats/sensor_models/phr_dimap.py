@@ -8,11 +8,11 @@ from amers.services.formats.sensor_models.xml_values import (
     midnight_before,
     number,
     numbers,
-    parse_xml,
     seconds,
     single,
     whole_number,
 )
+from amers.services.formats.text_files import parse_xml
 from amers.services.sensors.piecewise import extended, lagrange, polynomial
 from amers.services.sensors.pushbroom import (
     MAX_SIZE,

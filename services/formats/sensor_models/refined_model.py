@@ -4,9 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from amers.services.formats.images.ortho import write_refined_ortho
-from amers.services.formats.images.raster import open_raster
+from amers.services.formats.images.tiled_image import TiledImage
 from amers.services.formats.sensor_models.attitude_csv import ATTITUDE_CSV, format_attitude
 from amers.services.formats.sensor_models.correction_json import format_correction
+from amers.services.formats.sensor_models.product_image import open_image
 from amers.services.formats.sensor_models.rpc_files import (
     DeliveredModel,
     has_rpc,
@@ -212,7 +213,7 @@ def _write_fitted(
 
 def _delivered_rpc(image_path: Path, model_path: Path | None) -> DeliveredModel | None:
     """The RPC that was delivered beside a rigorous model; None without one."""
-    image = open_raster(image_path)
+    image = open_image(image_path)
     try:
         if model_path is None and not has_rpc(image):
             return None
@@ -228,6 +229,6 @@ def _write_grid(image_path: Path, grid: MapGrid, folder: Path, copied: bool) -> 
 
 
 def _is_geotiff(path: Path) -> bool:
-    image = open_raster(path)
+    image = open_image(path)
     image.close()
-    return bool(image.dataset.driver == "GTiff")
+    return bool(image.dataset.driver == "GTiff") and not isinstance(image, TiledImage)

@@ -6,9 +6,11 @@ from typing import NamedTuple
 
 from amers.services.errors import FormatError
 from amers.services.formats.addresses import FilePlace
-from amers.services.formats.images.raster import RasterImage
+from amers.services.formats.images.siblings import Siblings
+from amers.services.formats.images.tiled_image import SceneImage, TiledImage
+from amers.services.formats.sensor_models.place import stated_place
+from amers.services.formats.sensor_models.product_documents import airbus_names, document_names
 from amers.services.formats.sensor_models.rigorous_model import rigorous_model_in
-from amers.services.formats.sensor_models.rpc_files import crop_offset, files_named
 from amers.services.formats.text_files import read_text
 from amers.services.sensors.pushbroom import PushbroomModel
 
@@ -26,7 +28,7 @@ class DeliveredRigorousModel(NamedTuple):
 
 
 def rigorous_model_of_image(
-    image: RasterImage,
+    image: SceneImage,
     model_path: Path | None = None,
     crop_origin: tuple[float, float] | None = None,
 ) -> DeliveredRigorousModel | None:
@@ -56,29 +58,35 @@ def rigorous_model_of_image(
     return None
 
 
-def _metadata_of(image: RasterImage, model_path: Path | None) -> list[FilePlace]:
+def _metadata_of(image: SceneImage, model_path: Path | None) -> list[FilePlace]:
     """The files that may have the rigorous model of an image."""
     if model_path is not None:
         product = model_path.with_name(re.sub("^RPC_", "DIM_", model_path.name, flags=re.IGNORECASE))
         return [path for path in dict.fromkeys([model_path, product]) if path.is_file()]
     stem = image.path.stem
-    names = [f"{stem}.XML", f"{stem}.DIM", f"{stem}_RPC.XML"]
-    airbus = re.fullmatch(r"IMG_(.+?)(_R\d+C\d+)?", stem, re.IGNORECASE)
-    if airbus is not None:
-        names = [f"DIM_{airbus[1]}.XML", f"RPC_{airbus[1]}.XML", *names]
-    if stem.upper() == "IMAGERY":
-        names.append("METADATA.DIM")
-    return files_named(image.path, names)
+    if isinstance(image, TiledImage):
+        return [image.path, *Siblings(image.path).named([f"{stem}.XML"])]
+    rpcs = [f"RPC_{name}.XML" for name in airbus_names(stem)]
+    names = [*document_names(stem), *rpcs, f"{stem}.XML", f"{stem}.DIM", f"{stem}_RPC.XML"]
+    return Siblings(image.path).named(names)
 
 
 def _in_pixels_of(
-    image: RasterImage,
+    image: SceneImage,
     model: PushbroomModel,
     path: FilePlace,
     crop_origin: tuple[float, float] | None,
 ) -> PushbroomModel:
     """The part of a model that an image shows."""
-    origin = crop_origin or crop_offset(image)
+    origin = crop_origin
+    if origin is None and not isinstance(image, TiledImage):
+        place = stated_place(image, Siblings(image.path), path)
+        if place is not None and place.step != (1.0, 1.0):
+            raise FormatError(
+                f"{image.path}: reduced, {place}: the rigorous model of {path.name} is for all pixels; "
+                "register it without --rigorous"
+            )
+        origin = None if place is None else place.first
     if origin is None and re.search(r"_R1C1$", image.path.stem, re.IGNORECASE):
         origin = (0.0, 0.0)
     if origin is None:

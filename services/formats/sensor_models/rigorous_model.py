@@ -9,8 +9,7 @@ from amers.services.formats.sensor_models.dimap_rigorous import parse_dimap_rigo
 from amers.services.formats.sensor_models.phr_dimap import parse_phr_dimap
 from amers.services.formats.sensor_models.spot_dimap import parse_spot_dimap
 from amers.services.formats.sensor_models.worldview_isd import parse_worldview_isd
-from amers.services.formats.sensor_models.xml_values import parse_xml
-from amers.services.formats.text_files import read_text
+from amers.services.formats.text_files import parse_xml, read_text
 from amers.services.sensors.pushbroom import PushbroomModel
 from amers.services.sensors.rpc_fit import RpcFit, fit_rpc
 

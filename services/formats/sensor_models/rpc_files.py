@@ -1,37 +1,41 @@
 """The RPC of an image: finding it, converting it to the pixels of the image, writing a refined one."""
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from amers.services.errors import FormatError
-from amers.services.formats.addresses import Address, FilePlace
-from amers.services.formats.images.raster import RasterImage, copy_with_rpc, open_raster
-from amers.services.formats.sensor_models.dimap import format_dimap_rpc, parse_dimap_rpc
-from amers.services.formats.sensor_models.geom import format_geom, is_geom, parse_geom
-from amers.services.formats.sensor_models.rigorous_model import rpc_of_rigorous_model
-from amers.services.formats.sensor_models.rpc_text import (
-    RPC00A_ORDER,
-    format_rpb,
-    format_rpc_text,
-    parse_rpb,
-    parse_rpc_text,
-    rpb_satellite,
-    rpc_from_numbers,
+from amers.services.formats.addresses import FilePlace
+from amers.services.formats.images.raster import RasterImage, copy_with_rpc
+from amers.services.formats.images.siblings import Siblings
+from amers.services.formats.images.tiled_image import SceneImage, TiledImage
+from amers.services.formats.sensor_models.dimap import format_dimap_rpc
+from amers.services.formats.sensor_models.geom import format_geom
+from amers.services.formats.sensor_models.model_files import (
+    Convention,
+    FoundModel,
+    format_aux_rpc,
+    read_model_file,
 )
-from amers.services.formats.text_files import parse_number, read_text
+from amers.services.formats.sensor_models.model_order import (
+    ModelSource,
+    model_sources,
+    model_statements,
+    names_of_models,
+    other_model,
+)
+from amers.services.formats.sensor_models.place import Place, stated_place
+from amers.services.formats.sensor_models.product_documents import without_tile
+from amers.services.formats.sensor_models.product_image import open_image
+from amers.services.formats.sensor_models.rpc_text import format_rpb, format_rpc_text, rpb_satellite
+from amers.services.formats.text_files import read_text
 from amers.services.sensors.rpc import RpcModel, check_rpc
-from amers.services.statements import Statements
+from amers.services.statements import Statement, Statements, Subject, Use
 
-Convention = Literal["tags", "text", "rpb", "dimap", "geom", "rigorous"]
-
-_Found = tuple[RpcModel, FilePlace, Convention, str]
-"""A model, its file and format, and what was mended in it."""
-
+MODEL_SUFFIXES = (".txt", ".xml", ".rpb", ".rpc", ".geom", ".dim")
 _CROP_EVIDENCE = 2.0
 """How many times nearer to the first pixel the range of a model must start for an unambiguous choice."""
 
@@ -42,20 +46,30 @@ class DeliveredModel:
 
     Attributes:
         model: checked by `check_rpc`; (0, 0) is the centre of the first pixel of the image.
-        path: the file it was read from.
-        convention: format of the model in that file.
+        found: the same as its file has it.
         crop_origin: line and sample of the first pixel of the image in the image that the file models;
             subtracted from the image offsets of the file.
         note: one sentence: where the model was found, and why it was shifted or not.
         statements: of the files that were looked at.
+        place: of the image in the image that the file models; None where that is the image itself.
     """
 
     model: RpcModel
-    path: FilePlace
-    convention: Convention
+    found: FoundModel
     crop_origin: tuple[float, float]
     note: str
     statements: Statements = ()
+    place: Place | None = None
+
+    @property
+    def path(self) -> FilePlace:
+        """The file it was read from."""
+        return self.found.path
+
+    @property
+    def convention(self) -> Convention:
+        """Format of the model in that file."""
+        return self.found.convention
 
 
 def read_rpc(
@@ -63,19 +77,24 @@ def read_rpc(
 ) -> DeliveredModel:
     """The RPC of an image, in the pixels of that image.
 
-    The RPC is, in this order: the file `model_path`; the RPC tags of a GeoTIFF or the RPC00B of a NITF;
-    `STEM_RPC.TXT`, `STEM.RPB` or `STEM_RPC.XML` beside the image, for `IMG_NAME_R1C1` the `RPC_NAME.XML`
-    of its DIMAP, or `STEM.geom` (in upper or lower case; spelt like that at an address).
+    The RPC is the file `model_path`, else the first one in the order of GDAL (`model_order`): a model in
+    the tags of the image, or beside it in a file with the name that its producer gives it, in upper or
+    lower case (spelt like that at an address). Where an image has several, the record of statements
+    says which is used, and by how many pixels the others differ.
 
-    A crop often stores its position in the full scene as a geotransform of unit pixels without a
-    reference system. Its RPC may then be for the full scene or for the crop. The range of the RPC,
-    offset - scale to offset + scale, decides: it contains the image and starts near the first pixel of
-    the image it is for. Where both are possible, `crop_origin` must be given. A position in which both
+    The RPC of a product in tiles, and that of a NITF with ICHIPB, is for the full image: the document of
+    the product or the record state where the image is in it.
+
+    A crop often stores its position in the full scene as a geotransform without a reference system, of
+    unit pixels, or of larger ones where it is reduced. Its RPC may then be for the full scene or for the
+    crop. The range of the RPC, offset - scale to offset + scale, decides: it contains the image and
+    starts near the first pixel of the image it is for. Where both are possible, `crop_origin` must be
+    given. A position in which both
     numbers end in .5 counts from the centre of the first pixel, as OTB wrote it before 2014, and not
     from its corner: it stands for the whole pixel that follows.
 
     Args:
-        path: of the image.
+        path: of the image, or as for `open_image`.
         model_path: `_RPC.TXT`, `.RPB`, DIMAP or `.geom` file of any name, or metadata with a rigorous
             model, to which an RPC is fitted; by default the one found.
         crop_origin: line and sample of the first pixel of the image in the image that the RPC is for;
@@ -84,7 +103,7 @@ def read_rpc(
     Raises:
         FormatError: there is no usable RPC; the message lists what was searched for.
     """
-    image = open_raster(path)
+    image = open_image(path)
     try:
         return model_of_image(image, model_path, crop_origin)
     finally:
@@ -134,170 +153,221 @@ def write_model(
 
 
 def _in_delivered_format(delivered: DeliveredModel, model: RpcModel) -> dict[str, str]:
-    """The text of the file that replaces the delivered one, by its name."""
-    path = delivered.path
+    """The text of the file that replaces the delivered one, by its name.
+
+    It is in the pixels of the delivered file where the place of the image is stated for its format: it
+    is then read like the delivered one.
+    """
+    path, place = delivered.path, delivered.place
+    if place is not None and delivered.convention in place.decides_for - {"tags"}:
+        first, step = np.array(place.first), np.array(place.step)
+        model = replace(
+            model, image_offset=first + step * model.image_offset, image_scale=step * model.image_scale
+        )
     if delivered.convention == "rigorous":
         return {}
     if delivered.convention == "rpb":
         return {path.name: format_rpb(model, rpb_satellite(read_text(path)))}
+    if delivered.convention == "isd":
+        return {f"{path.stem}.RPB": format_rpb(model)}
     if delivered.convention == "dimap":
         return {path.name: format_dimap_rpc(read_text(path), model, path.name)}
     if delivered.convention == "geom":
         return {path.name: format_geom(model, read_text(path))}
+    if delivered.convention == "aux":
+        return {path.name: format_aux_rpc(read_text(path), model)}
     name = f"{path.stem}_RPC.TXT" if delivered.convention == "tags" else path.name
     return {name: format_rpc_text(model)}
 
 
 def model_of_image(
-    image: RasterImage, model_path: FilePlace | None, crop_origin: tuple[float, float] | None
+    image: SceneImage,
+    model_path: FilePlace | None,
+    crop_origin: tuple[float, float] | None,
+    siblings: Siblings | None = None,
 ) -> DeliveredModel:
     """The RPC of an open image; see `read_rpc`."""
+    siblings = siblings or Siblings(image.path)
     if model_path is not None:
-        model, path, convention, mended = _read_model_file(model_path)
-    else:
-        model, path, convention, mended = _find_model(image)
-    check_rpc(model, path.name)
-    offset = crop_offset(image)
-    tile = re.search(r"_R(\d+)C(\d+)$", image.path.stem, re.IGNORECASE)
-    if crop_origin is not None:
-        origin, reason = crop_origin, "shifted as requested" if any(crop_origin) else "as requested"
-    elif offset is not None:
-        origin, reason = _choose_origin(model, offset, image)
-    elif tile and convention in ("dimap", "rigorous") and (int(tile[1]), int(tile[2])) != (1, 1):
-        raise FormatError(
-            f"{image.path}: the image is a tile, and its RPC is for the whole image: give the position "
-            "of its first pixel in the whole image as crop_origin=(line, sample)"
+        return _delivered(read_model_file(model_path), image, siblings, crop_origin, given=model_path)
+    sources = list(model_sources(image, siblings))
+    if not sources:
+        raise FormatError(_no_model(image, siblings))
+    others = sources[1:]
+    used = _delivered(sources[0].read(), image, siblings, crop_origin)
+    if not others:
+        return used
+
+    def place(source: ModelSource) -> RpcModel:
+        return _delivered(source.read(), image, siblings, crop_origin).model
+
+    compared = [
+        (
+            f"tags of {source.path.name}" if source.kind == "tags" else source.path.name,
+            other_model(partial(place, source)),
         )
-    else:
-        origin, reason = (0.0, 0.0), "in the pixels of the image"
-    model = replace(model, image_offset=model.image_offset - np.array(origin))
-    _check_coverage(model, image, path)
-    note = ", ".join(part for part in (f"{convention} of {path.name}", mended, reason) if part)
-    return DeliveredModel(model, path, convention, origin, note)
+        for source in others
+    ]
+    statements = model_statements(used.found, used.model, compared, image.shape)
+    return replace(used, statements=(*statements, *used.statements[1:]))
 
 
-def has_rpc(image: RasterImage) -> bool:
-    """Whether an image has RPC tags, or beside it a file with the name of its RPC."""
-    return bool(image.dataset.tags(ns="RPC")) or bool(_files_beside(image)[1])
+def has_rpc(image: SceneImage, siblings: Siblings | None = None) -> bool:
+    """Whether an image has an RPC in its tags, or beside it in a file with the name of its model."""
+    sources = model_sources(image, siblings or Siblings(image.path))
+    return any(source.kind != "rigorous" for source in sources)
 
 
-def _find_model(image: RasterImage) -> _Found:
-    tags = image.dataset.tags(ns="RPC")
-    if tags:
-        records = image.dataset.tags(ns="TRE")
-        if "RPC00A" in records and "RPC00B" not in records:
-            tags = {**tags, **_rpc00a_coefficients(records["RPC00A"])}
-        return _parse_tags(tags, image.path.name), image.path, "tags", ""
-    names, files = _files_beside(image)
-    if files:
-        return _read_model_file(files[0])
-    raise FormatError(
-        f"{image.path}: no sensor model found: the file has neither a map grid nor RPC tags, and no "
-        f"file {', '.join(names)} lies beside it; add one of these, or give the file of the model"
+def _delivered(
+    found: FoundModel,
+    image: SceneImage,
+    siblings: Siblings,
+    crop_origin: tuple[float, float] | None,
+    given: FilePlace | None = None,
+) -> DeliveredModel:
+    """A model in the pixels of its image."""
+    check_rpc(found.model, found.path.name)
+    place, reason, stated = _place_of(found, image, siblings, crop_origin, given)
+    model = found.model
+    if place is not None:
+        first, step = np.array(place.first), np.array(place.step)
+        model = replace(
+            model,
+            image_offset=(model.image_offset - first) / step,
+            image_scale=model.image_scale / step,
+        )
+    _check_coverage(model, image, found.path)
+    note = ", ".join(
+        part for part in (f"{found.convention} of {found.path.name}", found.mended, reason) if part
     )
+    used = model_statements(found, model, [], image.shape)
+    origin = (0.0, 0.0) if place is None else place.first
+    return DeliveredModel(model, found, origin, note, (*used, *stated), place)
 
 
-def _files_beside(image: RasterImage) -> tuple[list[str], Sequence[FilePlace]]:
-    """The names that the RPC of an image may have, and the files beside the image with such a name."""
-    stem = image.path.stem
-    names = [f"{stem}_RPC.TXT", f"{stem}.RPB", f"{stem}_RPC.XML"]
-    airbus = re.fullmatch(r"IMG_(.+?)(_R\d+C\d+)?", stem, re.IGNORECASE)
-    if airbus is not None:
-        names.append(f"RPC_{airbus[1]}.XML")
-    names.append(f"{stem}.geom")
-    return names, files_named(image.path, names)
+def _place_of(
+    found: FoundModel,
+    image: SceneImage,
+    siblings: Siblings,
+    crop_origin: tuple[float, float] | None,
+    given: FilePlace | None,
+) -> tuple[Place | None, str, list[Statement]]:
+    """The place of an image in the image that a model is for, the reason, and what became of statements.
 
-
-def files_named(path: FilePlace, names: Sequence[str]) -> list[FilePlace]:
-    """The files beside an image that have one of these names, in upper or lower case, in their order."""
-    if isinstance(path, Address):
-        return [file for file in map(path.with_name, names) if file.is_file()]
-    beside = {file.name.upper(): file for file in path.resolve().parent.iterdir()}
-    return [beside[name.upper()] for name in names if name.upper() in beside]
-
-
-def _read_model_file(path: FilePlace) -> _Found:
-    """The RPC of a model file, whose content, not its name, decides on the format."""
-    text = read_text(path)
-    if text.lstrip("\ufeff \t\r\n").startswith("<"):
-        fit = rpc_of_rigorous_model(text, path.name)
-        if fit is not None:
-            note = f"RPC fitted to it within {fit.max_error_px:.2g} px"
-            return fit.model, path, "rigorous", note
-        return parse_dimap_rpc(text, path.name), path, "dimap", ""
-    if re.search(r"\bBEGIN_GROUP\b", text):
-        return parse_rpb(text, path.name), path, "rpb", ""
-    if is_geom(text):
-        model, mended = parse_geom(text, path.name)
-        return model, path, "geom", mended
-    return parse_rpc_text(text, path.name), path, "text", ""
-
-
-def _rpc00a_coefficients(record: str) -> dict[str, str]:
-    """The coefficients of an RPC00A record in the order of RPC00B.
-
-    Read from the record, because GDAL confuses four of the terms of the second degree.
+    No place means that the model is in the pixels of the image.
     """
-    starts = {"LINE_NUM": 81, "LINE_DEN": 321, "SAMP_NUM": 561, "SAMP_DEN": 801}
-    return {
-        f"{name}_COEFF": " ".join(record[start + 12 * i : start + 12 * (i + 1)] for i in RPC00A_ORDER)
-        for name, start in starts.items()
-    }
+    if crop_origin is not None and not any(crop_origin):
+        return None, "as requested", []
+    if isinstance(image, TiledImage):
+        return None, "in the pixels of the whole image", []
+    stated = stated_place(image, siblings, given)
+    if crop_origin is not None:
+        step = (1.0, 1.0) if stated is None else stated.step
+        return Place(crop_origin, step, "", "as requested"), "shifted as requested", []
+    if stated is None:
+        return None, "in the pixels of the image", _without_place(found, image)
+    shifts, reason = True, f"of the full image, {stated.what} at {stated}"
+    if found.convention not in stated.decides_for:
+        shifts, reason = _is_of_full_image(found.model, stated, image)
+    use = Use.USED if shifts else Use.NOT_USED
+    note = "" if shifts else f"{found.name} is in the pixels of this image"
+    statement = Statement(stated.file, Subject.PLACE, use, str(stated), where=stated.what, note=note)
+    return stated if shifts else None, reason, [statement]
 
 
-def _parse_tags(tags: dict[str, str], source: str) -> RpcModel:
-    def number(key: str) -> float:
-        name, _, index = key.partition("_COEFF_")
-        if key in ("ERR_BIAS", "ERR_RAND"):
-            return parse_number(tags.get(key, "-1"), key, source)
-        values = tags.get(f"{name}_COEFF" if index else key, "").split()
-        if len(values) != (20 if index else 1):
-            raise FormatError(f"{source}: RPC tags: {key} is missing")
-        return parse_number(values[int(index) - 1 if index else 0], key, source)
+def _without_place(found: FoundModel, image: RasterImage) -> list[Statement]:
+    """What is assumed, or refused, of a tile whose place nothing states."""
+    tile = without_tile(image.path.stem) != image.path.stem and "_R1C1" not in image.path.stem.upper()
+    if not tile:
+        return []
+    name = image.path.name
+    of_whole = found.convention in ("dimap", "rigorous") or (
+        found.convention in ("rpb", "isd") and without_tile(found.path.stem) == found.path.stem
+    )
+    if of_whole:
+        raise FormatError(
+            f"{image.path}: the image is a tile, and its RPC is for the whole image, {found.path.name}: "
+            "put the document of the product (DIM_….XML or .TIL) beside it, or give the position of its "
+            "first pixel in the whole image (--crop-origin LINE,SAMPLE; crop_origin=(line, sample))"
+        )
+    return [
+        Statement(
+            name,
+            Subject.PLACE,
+            Use.ASSUMED,
+            "line 0, sample 0",
+            note=f"its name says that it is a tile; {found.name} is taken to be for the tile alone, no "
+            ".TIL or DIM_….XML beside it states otherwise; --crop-origin LINE,SAMPLE does",
+        )
+    ]
 
-    return rpc_from_numbers(number)
+
+def _no_model(image: SceneImage, siblings: Siblings) -> str:
+    """Why an image has no model, and what mends it."""
+    names = list(dict.fromkeys(name for kind in names_of_models(image).values() for name in kind))
+    message = (
+        f"{image.path}: no sensor model found: the file has neither a map grid nor RPC tags, and no "
+        f"file {', '.join(names)} lies beside it; add one of these, or give the file of the model "
+        "(--model)"
+    )
+    if image.dataset.gcps[0]:
+        message += (
+            f"; it has {len(image.dataset.gcps[0])} ground control points, to which no model is fitted: "
+            "give its RPC, or warp it to a map first (gdalwarp -tps -t_srs EPSG:…)"
+        )
+    others = [
+        file.name
+        for suffix in MODEL_SUFFIXES
+        for file in siblings.ending(suffix)
+        if file.name.upper() not in map(str.upper, names) and _is_model(file)
+    ]
+    if others:
+        message += f"; {', '.join(others[:5])} beside it has a model: --model takes it"
+    return message
 
 
-def crop_offset(image: RasterImage) -> tuple[float, float] | None:
-    """Line and sample of the first pixel in the full scene, when the geotransform marks a crop."""
-    t = image.dataset.transform
-    unit = (t.a, t.b, t.d, t.e) == (1.0, 0.0, 0.0, 1.0)
-    if image.dataset.crs is not None or not unit:
-        return None
-    centred = t.c % 1.0 == 0.5 and t.f % 1.0 == 0.5
-    offset = (t.f + 0.5, t.c + 0.5) if centred else (t.f, t.c)
-    return None if offset == (0.0, 0.0) else offset
+def _is_model(file: FilePlace) -> bool:
+    try:
+        check_rpc(read_model_file(file).model, file.name)
+    except FormatError:
+        return False
+    return True
 
 
-def _choose_origin(
-    model: RpcModel, offset: tuple[float, float], image: RasterImage
-) -> tuple[tuple[float, float], str]:
-    """The crop origin of a model, `offset` for the full scene or (0, 0) for the crop, and the reason."""
+def _is_of_full_image(model: RpcModel, place: Place, image: RasterImage) -> tuple[bool, str]:
+    """Whether a model is of the full image in which an image has a place, and the reason.
+
+    Its range, offset - scale to offset + scale, contains the image, and starts near the first pixel of
+    the full image, once it is in the pixels that it is for.
+    """
+    first, step = np.array(place.first), np.array(place.step)
     start = model.image_offset - model.image_scale
     end = model.image_offset + model.image_scale
     margin = 0.1 * model.image_scale
     last = np.array(image.shape) - 1.0
     contains, distance = [], []
-    for origin in (np.zeros(2), np.array(offset)):
-        contains.append(bool((origin >= start - margin).all() and (origin + last <= end + margin).all()))
-        distance.append(float(np.hypot(*(start + np.array(offset) - origin))))
-    crop, full = contains
-    if crop and full:
-        crop = distance[0] * _CROP_EVIDENCE < distance[1]
+    for origin, scale in ((np.zeros(2), np.ones(2)), (first, step)):
+        inside = (origin >= start - margin).all() and (origin + scale * last <= end + margin).all()
+        contains.append(bool(inside))
+        distance.append(float(np.hypot(*(first + step * (start - origin) / scale))))
+    own, full = contains
+    if own and full:
+        own = distance[0] * _CROP_EVIDENCE < distance[1]
         full = distance[1] * _CROP_EVIDENCE < distance[0]
-    where = f"line {offset[0]:g}, sample {offset[1]:g}"
-    if crop and not full:
-        return (0.0, 0.0), f"already in the pixels of the crop at {where}"
-    if full and not crop:
-        return offset, f"of the full scene, shifted to the crop at {where}"
+    if full and not own:
+        return True, f"of the full scene, shifted to the crop at {place}"
+    if place.is_certain or (own and not full):
+        return False, f"already in the pixels of the crop at {place}"
+    kind = "a crop" if place.step == (1.0, 1.0) else "a reduced crop"
     raise FormatError(
-        f"{image.path}: a crop at {where}; its RPC, for lines {start[0]:g} to {end[0]:g} and samples "
+        f"{image.path}: {kind} at {place}; its RPC, for lines {start[0]:g} to {end[0]:g} and samples "
         f"{start[1]:g} to {end[1]:g}, may be for the crop or for the full scene: give "
-        f"crop_origin=(0, 0) or crop_origin=({offset[0]:g}, {offset[1]:g})"
+        f"crop_origin=(0, 0) or crop_origin=({place.first[0]:g}, {place.first[1]:g}) "
+        f"(--crop-origin 0,0 or --crop-origin {place.first[0]:g},{place.first[1]:g})"
     )
 
 
-def _check_coverage(model: RpcModel, image: RasterImage, path: FilePlace) -> None:
+def _check_coverage(model: RpcModel, image: SceneImage, path: FilePlace) -> None:
     """Refuse a model that cannot locate the corners of the image."""
     lines, samples = image.shape
     corners = np.array([[0, 0], [0, samples - 1], [lines - 1, samples - 1], [lines - 1, 0]], float)

@@ -18,7 +18,16 @@ from amers.services.types import Array
 Numbers = Callable[[str], float]
 """Returns the number of a key in the names of GDAL, such as `LINE_OFF` or `SAMP_DEN_COEFF_20`."""
 
-_TEXT_LINE = re.compile(rf"\s*(\w+)\s*[:=]\s*({NUMBER_PATTERN})(?:\s+[A-Za-z]+)?\s*")
+_TEXT_LINE = re.compile(rf"\s*(\w+)\s*[:=]\s*({NUMBER_PATTERN})(?:\s+([A-Za-z]+))?\s*")
+_PIXELS = ("pixels", "pixel", "px", "pix")
+_DEGREES = ("degrees", "degree", "deg")
+_METRES = ("metres", "meters", "metre", "meter", "m")
+_UNITS = {
+    **dict.fromkeys(("LINE", "SAMP"), _PIXELS),
+    **dict.fromkeys(("LAT", "LONG"), _DEGREES),
+    **dict.fromkeys(("HEIGHT", "ERR"), _METRES),
+}
+"""By the start of a key, the units in which its number may be stated."""
 _RPB_NUMBER = re.compile(rf"\s*(\w+)\s*=\s*({NUMBER_PATTERN})\s*;?\s*")
 _RPB_LIST = re.compile(r"\b(\w+)\s*=\s*\(([^()]*)\)")
 
@@ -26,7 +35,7 @@ RPC00A_ORDER = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 7, 11, 14, 17, 12, 15, 18, 13, 16
 """Positions in RPC00A of the terms of RPC00B. Source: NGA STDI-0002."""
 
 _POLYNOMIALS = ("LINE_NUM", "LINE_DEN", "SAMP_NUM", "SAMP_DEN")
-_RPB_KEYS = {
+RPB_KEYS = {
     "LINE_OFF": "lineOffset",
     "SAMP_OFF": "sampOffset",
     "LAT_OFF": "latOffset",
@@ -38,7 +47,7 @@ _RPB_KEYS = {
     "LONG_SCALE": "longScale",
     "HEIGHT_SCALE": "heightScale",
 }
-_RPB_LISTS = {
+RPB_LISTS = {
     "LINE_NUM": "lineNumCoef",
     "LINE_DEN": "lineDenCoef",
     "SAMP_NUM": "sampNumCoef",
@@ -54,7 +63,8 @@ def parse_rpc_text(text: str, source: str = "RPC text") -> RpcModel:
         source: its name, for messages.
 
     Raises:
-        FormatError: a line has another form, or a key is missing or given twice.
+        FormatError: a line has another form, a number is in another unit than pixels, degrees and
+            metres, or a key is missing or given twice.
     """
     numbers: dict[str, float] = {}
     for count, line in enumerate(text.splitlines(), start=1):
@@ -63,7 +73,14 @@ def parse_rpc_text(text: str, source: str = "RPC text") -> RpcModel:
         match = _TEXT_LINE.fullmatch(line)
         if match is None:
             raise FormatError(f"{source}, line {count}: expected 'KEY: number', found {line[:60]!r}")
-        _add(numbers, match[1].upper(), match[2], source)
+        key, unit = match[1].upper(), (match[3] or "").lower()
+        expected = _UNITS.get(key.partition("_")[0], ())
+        if unit and unit not in expected:
+            raise FormatError(
+                f"{source}, line {count}: {key} in {match[3][:20]!r} found, "
+                f"{expected[0] if expected else 'a number without a unit'} expected: convert it"
+            )
+        _add(numbers, key, match[2], source)
     return rpc_from_numbers(_lookup(numbers, source))
 
 
@@ -86,9 +103,9 @@ def parse_rpb(text: str, source: str = "RPB") -> RpcModel:
     order = re.search(r"\bspecId\s*=\s*\"?(\w+)", text, re.IGNORECASE)
     if order is None or order[1].upper() != "RPC00B":
         raise FormatError(f"{source}: SpecId: expected RPC00B, found {order[1] if order else 'none'}")
-    key_of = {name.lower(): key for key, name in _RPB_KEYS.items()}
+    key_of = {name.lower(): key for key, name in RPB_KEYS.items()}
     key_of |= {"errbias": "ERR_BIAS", "errrand": "ERR_RAND"}
-    polynomial_of = {name.lower(): key for key, name in _RPB_LISTS.items()}
+    polynomial_of = {name.lower(): key for key, name in RPB_LISTS.items()}
     numbers: dict[str, float] = {}
     for name, values in _RPB_LIST.findall(text):
         polynomial = polynomial_of.get(name.lower())
@@ -124,8 +141,8 @@ def format_rpb(model: RpcModel, satellite: str = "") -> str:
         f"\terrBias = {numbers.get('ERR_BIAS', 0.0)!r};",
         f"\terrRand = {numbers.get('ERR_RAND', 0.0)!r};",
     ]
-    lines += [f"\t{name} = {numbers[key]!r};" for key, name in _RPB_KEYS.items()]
-    for key, name in _RPB_LISTS.items():
+    lines += [f"\t{name} = {numbers[key]!r};" for key, name in RPB_KEYS.items()]
+    for key, name in RPB_LISTS.items():
         values = ",\n".join(f"\t\t\t{numbers[f'{key}_COEFF_{i}']!r}" for i in range(1, 21))
         lines += [f"\t{name} = (", values + ");"]
     return "\n".join([*lines, "END_GROUP = IMAGE", "END;", ""])

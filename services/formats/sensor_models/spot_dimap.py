@@ -10,11 +10,11 @@ from amers.services.formats.sensor_models.xml_values import (
     check_increasing,
     midnight_before,
     number,
-    parse_xml,
     seconds,
     single,
     whole_number,
 )
+from amers.services.formats.text_files import parse_xml
 from amers.services.sensors.attitude import integrated_rates, orbital_attitude
 from amers.services.sensors.piecewise import (
     PiecewisePolynomial,

@@ -1,5 +1,6 @@
 """WorldView ISD: the rigorous model of basic (1B) products of WorldView satellites."""
 
+import math
 from datetime import datetime
 from xml.etree import ElementTree
 
@@ -7,16 +8,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from amers.services.errors import FormatError
+from amers.services.formats.sensor_models.dimap import parse_imaging_time
 from amers.services.formats.sensor_models.xml_values import (
     check_increasing,
     midnight_before,
     number,
     numbers,
-    parse_xml,
     seconds,
     single,
     whole_number,
 )
+from amers.services.formats.text_files import parse_number, parse_xml
 from amers.services.sensors.attitude import interpolated_attitude
 from amers.services.sensors.light_path import LightPath
 from amers.services.sensors.piecewise import extended, lagrange, linear, polynomial
@@ -27,7 +29,7 @@ from amers.services.sensors.pushbroom import (
     check_pushbroom,
     used_times,
 )
-from amers.services.types import Array
+from amers.services.types import Acquisition, Array
 
 _LIGHT_PATH = LightPath(velocity_aberration=True, light_time=True, refraction=True)
 
@@ -85,6 +87,35 @@ def parse_worldview_isd(
         light_path=light_path,
     )
     return check_pushbroom(model, source)
+
+
+def parse_isd_acquisition(text: str, image_id: str, source: str = "ISD") -> Acquisition:
+    """Sensor, time and sun of an image from the XML of a WorldView product.
+
+    Args:
+        text: contents of the file.
+        image_id: name of the image.
+        source: name of the file, for messages.
+
+    Raises:
+        FormatError: it is not an XML document.
+    """
+    root = parse_xml(text, source)
+
+    def angle(name: str) -> float:
+        try:
+            return parse_number(root.findtext(f".//{name}", ""), name, source)
+        except FormatError:
+            return math.nan
+
+    date, _, time = root.findtext(".//FIRSTLINETIME", "").strip().partition("T")
+    return Acquisition(
+        image_id,
+        (root.findtext(".//SATID") or "").strip(),
+        parse_imaging_time(date, time),
+        sun_elevation_deg=angle("MEANSUNEL"),
+        sun_azimuth_deg=angle("MEANSUNAZ"),
+    )
 
 
 def _table(

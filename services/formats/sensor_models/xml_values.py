@@ -13,20 +13,6 @@ from amers.services.types import Array
 _TIME = re.compile(r"(\d{4}-\d\d-\d\d)T(\d\d:\d\d:\d\d)(\.\d{1,12})?Z?")
 
 
-def parse_xml(text: str, source: str) -> ElementTree.Element:
-    """The root of an XML document without a document type, hence without entities of its own.
-
-    Raises:
-        FormatError: it is not such a document.
-    """
-    if "<!DOCTYPE" in text:
-        raise FormatError(f"{source}: <!DOCTYPE found, a document without a document type expected")
-    try:
-        return ElementTree.fromstring(text)
-    except (ElementTree.ParseError, ValueError) as error:
-        raise FormatError(f"{source}: expected a well-formed XML document: {error}") from None
-
-
 def single(parent: ElementTree.Element, path: str, source: str) -> ElementTree.Element:
     """The only element at a path, anywhere below another element.
 

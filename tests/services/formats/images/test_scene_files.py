@@ -87,20 +87,22 @@ def test_a_model_beside_the_image_is_found(
     assert misfit_px(delivered.model, CROP) < a_millionth_of_a_pixel
 
 
-def test_tags_come_before_sidecars_and_an_explicit_model_before_all(tmp_path: Path) -> None:
+def test_files_beside_come_before_tags_as_in_gdal_and_an_explicit_model_before_all(
+    tmp_path: Path,
+) -> None:
     path = write_image(tmp_path / "a.tif", tagged=CROP)
-    other = replace(CROP, error_bias_m=9.0)
-    (tmp_path / "a_RPC.TXT").write_text(format_rpc_text(other))
-    assert read_rpc(path).convention == "tags"
-    assert read_rpc(path).model.error_bias_m == FULL.error_bias_m
-    assert read_rpc(path, tmp_path / "a_RPC.TXT").model.error_bias_m == 9.0
+    (tmp_path / "a_RPC.TXT").write_text(format_rpc_text(replace(CROP, error_bias_m=9.0)))
+    (tmp_path / "mine.txt").write_text(format_rpc_text(replace(CROP, error_bias_m=8.0)))
+    assert read_rpc(path).convention == "text"
+    assert read_rpc(path).model.error_bias_m == 9.0
+    assert read_rpc(path, tmp_path / "mine.txt").model.error_bias_m == 8.0
 
 
 def test_without_a_model_the_message_lists_the_files_searched_for(tmp_path: Path) -> None:
     path = write_image(tmp_path / "IMG_a_R1C1.tif")
     with pytest.raises(
         FormatError,
-        match=r"no file IMG_a_R1C1_RPC.TXT, .*\.RPB, .*RPC_a\.XML, IMG_a_R1C1\.geom lies beside",
+        match=r"no file IMG_a_R1C1\.RPB, .*_RPC\.TXT, RPC_a\.XML, .*, IMG_a_R1C1\.geom, .* lies beside",
     ):
         read_rpc(path)
 

@@ -1,0 +1,94 @@
+"""The image that a path stands for: an image file, a product in tiles by its document, or a folder."""
+
+from pathlib import Path
+
+from amers.services.errors import FormatError
+from amers.services.formats.addresses import Address, FilePlace
+from amers.services.formats.images.bands import BandMix
+from amers.services.formats.images.raster import open_raster
+from amers.services.formats.images.tiled_image import SceneImage, open_tiles
+from amers.services.formats.members import folder_member
+from amers.services.formats.sensor_models.product_documents import (
+    ProductTile,
+    is_document,
+    read_product,
+)
+from amers.services.formats.text_files import read_text
+
+IMAGE_SUFFIXES = (".tif", ".tiff", ".jp2", ".j2k", ".ntf", ".nitf", ".nsf")
+
+
+def open_image(path: FilePlace, bands: int | BandMix | None = 1) -> SceneImage:
+    """Open an image file, or all files of a product in tiles as one image.
+
+    Args:
+        path: of an image, of the document that lists its tiles (`DIM_….XML`, `METADATA.DIM`, `.TIL`), or
+            of a folder with one of these.
+        bands: as for `open_raster`.
+
+    Raises:
+        FormatError: the image cannot be used, or a tile of it is missing.
+    """
+    if isinstance(path, Path) and path.is_dir():
+        found = scenes_in(path)
+        if len(found) != 1:
+            names = ", ".join(file.name for file in found[:5]) or "none"
+            raise FormatError(f"{path}: {len(found)} images found ({names}), a folder with one expected")
+        path = found[0]
+    if not is_document(path):
+        return open_raster(path, bands)
+    tiles = read_product(path)
+    files = [tile_file(tile) for tile in tiles]
+    missing = [file.name for file in files if not file.is_file()]
+    if missing:
+        raise FormatError(
+            f"{path}: of its {len(tiles)} tiles {len(missing)} not found: {', '.join(missing[:5])}; put "
+            f"them beside {path.name}, or give the tiles that are there: each keeps its place"
+        )
+    if len(tiles) == 1:
+        return open_raster(files[0], bands)
+    parts = [(file, tile.first, tile.shape) for file, tile in zip(files, tiles, strict=True)]
+    return open_tiles(path, tiles[0].product_shape, parts, bands)
+
+
+def tile_file(tile: ProductTile) -> FilePlace:
+    """The file of a tile; its name in upper or lower case.
+
+    Raises:
+        FormatError: its name leads out of the folder of its document.
+    """
+    if isinstance(tile.document, Address):
+        return tile.document.with_name(tile.name)
+    file = folder_member(tile.document.parent, tile.name, "the folder of the product")
+    if not file.is_file() and file.parent.is_dir():
+        alike = (other for other in file.parent.iterdir() if other.name.upper() == file.name.upper())
+        return next(alike, file)
+    return file
+
+
+def scenes_in(folder: Path) -> list[Path]:
+    """The scenes directly inside a folder, by name: images, and documents in place of their tiles.
+
+    Raises:
+        FormatError: the document of a product in tiles cannot be used.
+    """
+    files = sorted(folder.iterdir())
+    images = [file for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
+    scenes: list[Path] = []
+    for document in files:
+        if not _lists_tiles(document):
+            continue
+        tiles = [tile_file(tile) for tile in read_product(document)]
+        if len(tiles) > 1 and any(tile in images for tile in tiles):
+            scenes.append(document)
+            images = [image for image in images if image not in tiles]
+    return sorted([*images, *scenes])
+
+
+def _lists_tiles(file: Path) -> bool:
+    """Whether a file is the document of a product in several files."""
+    name = file.name.upper()
+    if name.endswith(".TIL"):
+        return True
+    is_dimap = name == "METADATA.DIM" or (name.startswith("DIM_") and name.endswith(".XML"))
+    return is_dimap and read_text(file).count("<DATA_FILE_PATH") > 1
