@@ -72,6 +72,18 @@ class DatumShift:
         )
 
 
+def filled_sigmas(sigma_m: Array, stated_m: tuple[float, float], datum_sigma_m: float) -> Array:
+    """Sigmas (n, 3) of points, with those that somebody states for points without any.
+
+    Args:
+        sigma_m: (n, 3) east, north, up, with the accuracy of the datum; NaN where unknown.
+        stated_m: horizontal and up, without the accuracy of the datum.
+        datum_sigma_m: that accuracy.
+    """
+    horizontal_m = math.hypot(stated_m[0], datum_sigma_m)
+    return np.where(np.isnan(sigma_m), [horizontal_m, horizontal_m, stated_m[1]], sigma_m)
+
+
 @cache
 def horizontal(crs: str) -> CRS:
     """The horizontal part of a reference system, WKT or a code.
@@ -148,26 +160,39 @@ def _datum_shift(crs: str, x: float, y: float, source: str) -> DatumShift:
     )
 
 
-def missing_grids(crs: CRS) -> str:
-    """Which grids PROJ lacks to reach WGS 84 from a CRS, and where they are; "" when it lacks none."""
-    operations = transformations(crs).unavailable_operations
-    grids = [grid for step in operations for grid in step.grids if not grid.available]
-    published = sorted({grid.short_name for grid in grids if grid.url})
-    names = published or sorted({grid.short_name for grid in grids})
-    if not names:
-        return ""
-    message = f": PROJ has no {' or '.join(names)} installed"
-    if published:
-        message += (
-            f"; the package proj-data of conda-forge has it, or run: pyproj sync --file {names[0]}"
+def missing_grids(crs: CRS, area: AreaOfInterest | None = None) -> str:
+    """Which grids PROJ lacks to reach WGS 84 from a CRS, and where they are; "" when it lacks none.
+
+    They are those of the first operation whose grids are published, and of one grid if there is one.
+    """
+    lacking = [
+        (
+            not all(grid.url for grid in step.grids if not grid.available),
+            [grid.short_name for grid in step.grids if not grid.available],
         )
+        for step in transformations(crs, area).unavailable_operations
+        if not all(grid.available for grid in step.grids)
+    ]
+    if not lacking:
+        return ""
+    is_unpublished, names = min(lacking, key=lambda step: (step[0], len(step[1])))
+    message = f": PROJ has no {' and '.join(names)} installed"
+    if not is_unpublished:
+        runs = " and ".join(f"pyproj sync --file {name}" for name in names)
+        message += f"; the package proj-data of conda-forge has it, or run: {runs}"
     if "us_nga_egm96_15.tif" in names:
         message += "; or install the package proj-data of Debian, which has it as egm96_15.gtx"
     return message
 
 
+def area_of(place: Array) -> AreaOfInterest:
+    """The area of one longitude and latitude (2,), for the choice of an operation."""
+    lon, lat = (float(value) for value in place)
+    return AreaOfInterest(lon, lat, lon, lat)
+
+
 def transformations(crs: CRS, area: AreaOfInterest | None = None) -> TransformerGroup:
-    """The transformations to WGS 84 that are not approximate."""
+    """The transformations to WGS 84 that are not approximate, of all areas or of one."""
     with warnings.catch_warnings():
         # PROJ warns that the best transformation is not installed; the callers handle it.
         warnings.simplefilter("ignore", UserWarning)
@@ -217,7 +242,7 @@ def _is_null(system: CRS, x: float, y: float, lon: float, lat: float) -> bool:
 
 def _better(system: CRS, lon: float, lat: float, accuracy_m: float) -> str:
     """A sentence on a more accurate operation of this place whose grid PROJ lacks."""
-    area = AreaOfInterest(lon, lat, lon, lat)
+    area = area_of(np.array([lon, lat]))
     better = [
         (operation.accuracy, grid.short_name)
         for operation in transformations(system, area).unavailable_operations

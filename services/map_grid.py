@@ -150,9 +150,9 @@ def continuous_xy(crs: str, lon_lat: Array) -> Array:
 
     On a geographic map they are continuous, too: they may exceed a half turn.
     """
-    xy, horizontal = xy_of_lon_lat(crs, lon_lat), _horizontal(crs)
-    if horizontal.is_geographic and len(xy):
-        degree = np.radians(1.0) / float(horizontal.axis_info[0].unit_conversion_factor)
+    xy, system = xy_of_lon_lat(crs, lon_lat), horizontal(crs)
+    if system.is_geographic and len(xy):
+        degree = np.radians(1.0) / float(system.axis_info[0].unit_conversion_factor)
         beyond = xy[:, 0] - xy[0, 0] - (lon_lat[:, 0] - lon_lat[0, 0]) * degree
         xy[:, 0] -= 360.0 * degree * np.round(beyond / (360.0 * degree))
     return xy
@@ -182,7 +182,7 @@ def map_units_per_metre(crs: str, lon_lat: Array) -> Array:
     of_ground = np.array([sample, -line])
     if grid.is_geographic:
         return np.asarray(1.0 / np.linalg.norm(np.linalg.inv(of_ground), axis=0))
-    in_true_metre = 1.0 / float(_horizontal(crs).axis_info[0].unit_conversion_factor)
+    in_true_metre = 1.0 / float(horizontal(crs).axis_info[0].unit_conversion_factor)
     per_metre = float(abs(np.linalg.det(of_ground))) ** 0.5
     is_true = abs(per_metre / in_true_metre - 1.0) <= NEARLY_TRUE
     return np.full(2, in_true_metre if is_true else per_metre)

@@ -211,12 +211,15 @@ class GroundPoints:
         lon_lat_h: (n, 3); the height is NaN where unknown.
         sigma_m: (n, 3) east, north, up, one standard deviation; NaN where unknown.
         statements: of their file.
+        datum_sigma_m: accuracy of the transformation of their datum, one standard deviation of a
+            horizontal coordinate. It is in `sigma_m` where that is known.
     """
 
     id: StrArray
     lon_lat_h: Array
     sigma_m: Array
     statements: Statements = ()
+    datum_sigma_m: float = 0.0
 
     def __len__(self) -> int:
         return len(self.id)

@@ -1,13 +1,14 @@
 """Files of ground points marked in images, as control of a block."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from amers.app.errors import InputError
+from amers.services.datums import filled_sigmas
 from amers.services.formats.addresses import FilePlace
 from amers.services.formats.gcp.marked_points import MarkedPoints
 from amers.services.formats.gcp.reader import StatedByCaller, read_marked_ground
@@ -61,14 +62,14 @@ def read_marked(
         marks = _control_marks(read_marked_ground(path, points.stated), path)
         image.append(_images_of(marks, path, scenes, images))
         names += [f"{path.name}:{name}" for name in marks.id]
+        if points.sigma_m is not None:
+            sigma_m = filled_sigmas(marks.sigma_m, points.sigma_m, marks.datum_sigma_m)
+            marks = replace(marks, sigma_m=sigma_m)
         files.append(marks)
     lon_lat_h, sigma_m, line_sample, sigma_px = (
         np.concatenate([getattr(marks, column) for marks in files])
         for column in ("lon_lat_h", "sigma_m", "line_sample", "sigma_px")
     )
-    if points.sigma_m is not None:
-        horizontal_m, up_m = points.sigma_m
-        sigma_m = np.where(np.isnan(sigma_m), [horizontal_m, horizontal_m, up_m], sigma_m)
     sigma_m[np.isnan(lon_lat_h[:, 2]), 2] = np.inf
     _refuse_unknown_sigmas(sigma_m, names)
     mark_sigma_px = points.mark_sigma_px or MARKING_SIGMA_PX

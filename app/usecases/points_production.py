@@ -18,6 +18,7 @@ from amers.app.usecases.new_block import (
     refuse_existing,
 )
 from amers.app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
+from amers.services.datums import filled_sigmas
 from amers.services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification
 from amers.services.formats.block.writer import write_block
 from amers.services.formats.gcp.base_chips import open_base_chip, read_base_chips
@@ -188,9 +189,7 @@ def _ground_points(files: KnownPointFiles) -> GroundPoints:
     ground = read_ground_points(files.points, files.stated)
     sigma_m = ground.sigma_m
     if files.point_sigma_m is not None:
-        horizontal_m, up_m = files.point_sigma_m
-        stated_m = np.array([horizontal_m, horizontal_m, up_m])
-        sigma_m = np.where(np.isnan(sigma_m), stated_m, sigma_m)
+        sigma_m = filled_sigmas(sigma_m, files.point_sigma_m, ground.datum_sigma_m)
     ground = replace(ground, sigma_m=sigma_m)
     missing = np.isnan(ground.lon_lat_h[:, 2])
     if not missing.any():

@@ -1,6 +1,6 @@
 """Reading digital elevation models as terrain with heights above the WGS 84 ellipsoid."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -8,9 +8,8 @@ import numpy as np
 from pyproj import CRS
 
 from amers.services.errors import CoverageError, FormatError, VerticalDatumError
-from amers.services.formats.addresses import FilePlace
-from amers.services.formats.elevation.geoid import geoid_of_crs, geoid_of_grid, vertical_crs
-from amers.services.formats.images.raster import RasterImage, map_grid_of, open_raster
+from amers.services.formats.elevation.heights import HeightsByCaller, height_datum
+from amers.services.formats.images.raster import RasterImage, map_grid_of, open_raster, shift_of_grid
 from amers.services.imagery.source import ImageSource, Window
 from amers.services.terrain import Geoid, Terrain
 from amers.services.types import FloatImage
@@ -44,17 +43,24 @@ def read_dem(
         grid = map_grid_of(image)
         if grid is None:
             raise FormatError(f"{path}: expected heights with a map grid, found no reference system")
-        unit_m, geoid_heights, note = _vertical_datum(image, vertical, geoid)
+        shift = shift_of_grid(image, grid)
+        middle = grid.lon_lat((np.array([grid.shape]) - 1.0) / 2.0)[0]
+        caller = HeightsByCaller(vertical, geoid)
+        unit = image.dataset.units[image.band - 1] or ""
+        datum = height_datum(CRS.from_wkt(grid.crs), shift, middle, caller, str(path), band_unit=unit)
     except (FormatError, VerticalDatumError):
         image.close()
         raise
-    heights: ImageSource = _Heights(image, unit_m)
+    heights: ImageSource = _Heights(image, datum.unit_m)
+    note = datum.origin
     if fill_px > 0:
         heights = FilledVoids(heights, fill_px)
         note += f"; voids filled from heights within {fill_px} nodes"
-    terrain = Terrain(grid, heights, geoid_heights, note)
-    if geoid_heights is not None:
-        _check_geoid_coverage(terrain, geoid_heights, path)
+    of_datum = (replace(statement, file=path.name) for statement in datum.statements)
+    statements = (*image.statements, shift.statement(path.name), *of_datum)
+    terrain = Terrain(grid, heights, datum.zero_m, note, statements)
+    if datum.zero_m is not None:
+        _check_geoid_coverage(terrain, datum.zero_m, path)
     return terrain
 
 
@@ -128,59 +134,6 @@ class _Heights:
             void |= (heights < HEIGHTS_M[0]) | (heights > HEIGHTS_M[1])
         heights[void] = np.nan
         return heights
-
-
-def _vertical_datum(
-    image: RasterImage, requested: str | None, grid: Path | None
-) -> tuple[float, Geoid | None, str]:
-    """Metres per unit, the geoid (None for the ellipsoid), and one sentence on their origin."""
-    path = image.path
-    of_file, file_states = _vertical_of_file(CRS.from_wkt(image.dataset.crs.to_wkt(version="WKT2_2019")))
-    of_caller = None if requested is None else vertical_crs(requested)
-    if file_states and requested is not None and _name(of_file) != _name(of_caller):
-        raise VerticalDatumError(
-            f"{path}: the file states heights above {_name(of_file)}, the caller {_name(of_caller)}; "
-            "omit the vertical datum or correct it"
-        )
-    if not file_states and requested is None and grid is None:
-        raise VerticalDatumError(
-            f"{path}: the file does not state its vertical datum: give ellipsoid, EGM96, EGM2008 or the "
-            "code of a vertical reference system"
-        )
-    who = "the file" if file_states else "the caller"
-    vertical = of_file if file_states else of_caller
-    if grid is not None:
-        if vertical is None and (file_states or requested is not None):
-            raise VerticalDatumError(
-                f"{path}: heights are above the ellipsoid, by {who}, and need no geoid; omit {grid.name}"
-            )
-        name = "the geoid" if vertical is None else vertical.name
-        return _unit_m(vertical, path), geoid_of_grid(grid), f"{name} by {who}, from {grid.name}"
-    if vertical is None:
-        return 1.0, None, f"metres above the ellipsoid, by {who}"
-    note = f"{vertical.name} by {who}, from the grids of PROJ"
-    return _unit_m(vertical, path), geoid_of_crs(vertical), note
-
-
-def _vertical_of_file(crs: CRS) -> tuple[CRS | None, bool]:
-    """The vertical reference system of a file, None for the ellipsoid; whether the file states it."""
-    if crs.is_compound:
-        return crs.sub_crs_list[1], True
-    return None, len(crs.axis_info) == 3
-
-
-def _name(vertical: CRS | None) -> str:
-    return "the ellipsoid" if vertical is None else vertical.name
-
-
-def _unit_m(vertical: CRS | None, path: FilePlace) -> float:
-    """Metres per unit of a vertical reference system."""
-    if vertical is None:
-        return 1.0
-    axis = vertical.axis_info[0]
-    if axis.direction.lower() != "up":
-        raise VerticalDatumError(f"{path}: {vertical.name} found, which counts depths; heights expected")
-    return float(axis.unit_conversion_factor)
 
 
 def _check_geoid_coverage(terrain: Terrain, geoid: Geoid, path: Path) -> None:

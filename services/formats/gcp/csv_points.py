@@ -11,14 +11,14 @@ from pyproj import CRS
 
 from amers.services.errors import FormatError, InputError
 from amers.services.formats.gcp.marked_points import (
-    ELLIPSOID,
+    Ground,
     Heights,
     MarkedPoints,
     marked_points,
     parse_crs,
     to_wgs84,
 )
-from amers.services.formats.gcp.text_lines import check_lon_lat, coordinate_array, sequential_ids
+from amers.services.formats.gcp.text_lines import check_lon_lat, sequential_ids
 from amers.services.formats.text_files import parse_number
 from amers.services.types import Array
 
@@ -262,8 +262,8 @@ def _ground(
     source: str,
     *,
     on_map: bool,
-) -> Array:
-    """Points (n, 3) in WGS 84; points without a height need no vertical datum."""
+) -> Ground:
+    """Points in WGS 84; points without a height need no vertical datum."""
     names = ("x", "y") if on_map else ("lon", "lat")
     height_m = numbers.get("height_m", np.full(len(wheres), np.nan))
     for x, y, where in zip(numbers[names[0]], numbers[names[1]], wheres, strict=True):
@@ -271,10 +271,5 @@ def _ground(
             raise FormatError(f"{where}: expected {names[0]} and {names[1]}, found an empty field")
         if not on_map:
             check_lon_lat(x, y, where)
-    missing = np.isnan(height_m)
-    points = coordinate_array(
-        list(zip(numbers[names[0]], numbers[names[1]], np.where(missing, 0.0, height_m), strict=True))
-    )
-    ground = to_wgs84(points, crs, ELLIPSOID if missing.all() else heights, source)
-    ground[missing, 2] = np.nan
-    return ground
+    points = np.column_stack([numbers[names[0]], numbers[names[1]], height_m])
+    return to_wgs84(points, crs, heights, source)

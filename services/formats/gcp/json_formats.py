@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from pyproj import CRS
 
 from amers.services.errors import FormatError, InputError, VerticalDatumError
 from amers.services.formats.gcp.marked_points import (
+    Ground,
     MarkedPoints,
     horizontal_unit_m,
     marked_points,
@@ -18,6 +20,7 @@ from amers.services.formats.gcp.marked_points import (
 )
 from amers.services.formats.gcp.text_lines import check_lon_lat
 from amers.services.formats.text_files import load_json
+from amers.services.statements import Statements, gathered
 from amers.services.types import Array, Measures
 
 OPF_FORMAT = "application/opf-input-control-points+json"
@@ -172,8 +175,8 @@ def parse_opf(text: str, source: str = "OPF") -> MarkedPoints:
     """The marked points of the input control points of OPF 1.0.
 
     The extension of Amers gives the names of the images; without it the name is the id of the camera.
-    Heights are those of the CRS of each point, or above its ellipsoid when it is two-dimensional, as OPF
-    specifies.
+    Heights are those of the CRS of each point; where it is two-dimensional, OPF says "the ellipsoid",
+    which is taken as that of WGS 84, as GNSS gives.
 
     Args:
         text: contents of the file.
@@ -197,7 +200,8 @@ def parse_opf(text: str, source: str = "OPF") -> MarkedPoints:
     rows = []
     for count, gcp in enumerate(gcps, start=1):
         rows += _opf_rows(gcp, images, f"{source}, gcp {count}")
-    return _points_from_rows(rows)
+    statements = [one for row in rows for one in row.pop("statements")]
+    return _points_from_rows(rows, gathered(statements))
 
 
 _NOT_MARKED = (math.nan, math.nan)
@@ -206,10 +210,14 @@ Row = dict[str, Any]
 """One mark: values by the attribute names of `MarkedPoints`."""
 
 
-def _points_from_rows(rows: list[Row]) -> MarkedPoints:
+def _points_from_rows(rows: list[Row], statements: Statements = ()) -> MarkedPoints:
     columns: dict[str, Any] = {name: [row[name] for row in rows] for name in rows[0]} if rows else {}
     return marked_points(
-        columns.pop("id", []), columns.pop("lon_lat_h", []), columns.pop("line_sample", []), **columns
+        columns.pop("id", []),
+        columns.pop("lon_lat_h", []),
+        columns.pop("line_sample", []),
+        statements,
+        **columns,
     )
 
 
@@ -258,10 +266,12 @@ def _opf_rows(gcp: Any, images: dict[str, Any], where: str) -> list[Row]:
     if not isinstance(marks, list) or not all(isinstance(mark, dict) for mark in marks):
         raise FormatError(f"{where}: expected a list of marks")
     ground, sigma_m = _opf_ground(location, where)
+    file = where.rpartition(", gcp ")[0]
     point = {
         "id": str(gcp.get("id")),
-        "lon_lat_h": ground,
-        "sigma_m": sigma_m,
+        "lon_lat_h": ground.lon_lat_h[0],
+        "sigma_m": [*(math.hypot(sigma, ground.sigma_m) for sigma in sigma_m[:2]), sigma_m[2]],
+        "statements": [replace(one, file=file) for one in ground.statements],
         "check": gcp.get("is_checkpoint") is True,
     }
     unmarked = {"line_sample": _NOT_MARKED, "image": "", "sigma_px": math.nan}
@@ -280,7 +290,7 @@ def _opf_rows(gcp: Any, images: dict[str, Any], where: str) -> list[Row]:
     return rows
 
 
-def _opf_ground(location: dict[str, Any], where: str) -> tuple[list[float], list[float]]:
+def _opf_ground(location: dict[str, Any], where: str) -> tuple[Ground, list[float]]:
     """Longitude, latitude, height and the sigmas east, north, up of a geolocation."""
     crs_node = location.get("crs")
     if not isinstance(crs_node, dict) or not isinstance(crs_node.get("definition"), str):
@@ -297,8 +307,9 @@ def _opf_ground(location: dict[str, Any], where: str) -> tuple[list[float], list
         crs = crs.sub_crs_list[0]
     elif len(crs.axis_info) < 3:
         coordinates[:, 2] *= unit_m
-    ground = to_wgs84(coordinates, crs, "ellipsoid", where, axes_of_crs=True)[0]
-    return ground.tolist(), [east * unit_m, north * unit_m, sigmas[2] * up_unit_m]
+    heights = None if crs.is_compound else "ellipsoid"
+    ground = to_wgs84(coordinates, crs, heights, where, axes_of_crs=True)
+    return ground, [east * unit_m, north * unit_m, sigmas[2] * up_unit_m]
 
 
 def _east_first(crs: CRS) -> bool:

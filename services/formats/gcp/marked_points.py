@@ -19,7 +19,7 @@ Only the readers and writers of these formats convert: everywhere else the centr
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +27,11 @@ import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
-from amers.services.datums import missing_grids
+from amers.services.datums import DatumShift, datum_shift, from_wgs84, horizontal, missing_grids
 from amers.services.errors import FormatError, MissingGeoid, VerticalDatumError
-from amers.services.formats.elevation.geoid import (
-    geoid_of_crs,
-    geoid_of_grid,
-    vertical_crs,
-)
-from amers.services.statements import Statements
+from amers.services.formats.elevation.geoid import vertical_crs
+from amers.services.formats.elevation.heights import HeightDatum, HeightsByCaller, height_datum
+from amers.services.statements import Statement, Statements, Subject, Use
 from amers.services.types import Array, BoolArray, StrArray
 
 WGS84_3D = CRS.from_epsg(4979)
@@ -63,6 +60,8 @@ class MarkedPoints:
         active: (n,) whether the mark is to be used.
         check: (n,) whether the point is a check point, held out of the adjustment.
         statements: of the file.
+        datum_sigma_m: accuracy of the transformation of the datum, one standard deviation of a
+            horizontal coordinate. It is in `sigma_m` where that is known.
     """
 
     id: StrArray
@@ -75,6 +74,7 @@ class MarkedPoints:
     active: BoolArray
     check: BoolArray
     statements: Statements = ()
+    datum_sigma_m: float = 0.0
 
     def __len__(self) -> int:
         return len(self.id)
@@ -86,13 +86,34 @@ class MarkedPoints:
 
     def take(self, rows: BoolArray) -> "MarkedPoints":
         """The marks where a mask (n,) is true."""
-        columns = {name: values[rows] for name, values in vars(self).items() if name != "statements"}
-        return MarkedPoints(**columns, statements=self.statements)
+        columns: dict[str, Any] = {
+            name: values[rows] for name, values in vars(self).items() if isinstance(values, np.ndarray)
+        }
+        return replace(self, **columns)
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Ground points of a file in WGS 84.
+
+    Attributes:
+        lon_lat_h: (n, 3); the height is NaN where the file has none.
+        sigma_m: of their positions by the transformation of the datum, one standard deviation of each
+            horizontal coordinate; 0 where there is none.
+        statements: on datums and units.
+    """
+
+    lon_lat_h: Array
+    sigma_m: float
+    statements: Statements
+
+    def __len__(self) -> int:
+        return len(self.lon_lat_h)
 
 
 def marked_points(
     id: list[str],
-    lon_lat_h: list[tuple[float, float, float]] | Array,
+    lon_lat_h: Ground | list[tuple[float, float, float]] | Array,
     line_sample: list[tuple[float, float]] | Array,
     statements: Statements = (),
     **attributes: Any,
@@ -100,7 +121,7 @@ def marked_points(
     """Marked points with default attributes: unknown sigmas and residuals, active, no check points.
 
     Args:
-        id, lon_lat_h, line_sample: n rows.
+        id, lon_lat_h, line_sample: n rows; the sigma and the statements of a `Ground` are added.
         statements: of the file.
         attributes: other attributes of `MarkedPoints`, n rows, that replace the defaults.
     """
@@ -117,25 +138,33 @@ def marked_points(
         default = columns[name]
         dtype = {"U": np.str_, "b": np.bool_}.get(default.dtype.kind, np.float64)
         columns[name] = np.array(values, dtype=dtype).reshape(default.shape)
+    datum_sigma_m = 0.0
+    if isinstance(lon_lat_h, Ground):
+        horizontal_m = columns["sigma_m"][:, :2]
+        horizontal_m[:] = np.copysign(np.hypot(horizontal_m, lon_lat_h.sigma_m), horizontal_m)
+        datum_sigma_m = lon_lat_h.sigma_m
+        statements = (*statements, *lon_lat_h.statements)
+        lon_lat_h = lon_lat_h.lon_lat_h
     return MarkedPoints(
         id=np.array(id, dtype=np.str_),
         lon_lat_h=np.array(lon_lat_h, dtype=np.float64).reshape(n, 3),
         line_sample=np.array(line_sample, dtype=np.float64).reshape(n, 2),
         **columns,
         statements=statements,
+        datum_sigma_m=datum_sigma_m,
     )
 
 
 def to_wgs84(
     coordinates: Array, crs: CRS, heights: Heights | None, source: str, axes_of_crs: bool = False
-) -> Array:
-    """Longitude, latitude and height above the WGS 84 ellipsoid (n, 3) of points in any CRS.
+) -> Ground:
+    """Points in any CRS as longitude, latitude and height above the WGS 84 ellipsoid.
 
     Args:
         coordinates: (n, 3) east or longitude first, unless `axes_of_crs`; heights are metres where `crs`
-            has none.
+            has none, and NaN where a point has none.
         crs: reference system of the coordinates.
-        heights: datum of the heights where `crs` has none.
+        heights: datum of the heights where `crs` has none; not needed where no point has a height.
         source: name of the file, for messages.
         axes_of_crs: the coordinates are in the order of the axes of `crs`.
 
@@ -143,38 +172,83 @@ def to_wgs84(
         VerticalDatumError: the datum of the heights is unknown, or the grid it needs is not installed.
         FormatError: the points cannot be transformed to WGS 84.
     """
-    if len(crs.axis_info) >= 3:
-        return _transformed(coordinates, crs, source, axes_of_crs)
-    if heights is None:
+    height = coordinates[:, 2]
+    flat = np.column_stack([coordinates[:, :2], np.nan_to_num(height, nan=0.0)])
+    in_space = len(crs.axis_info) >= 3 and not crs.is_compound
+    if in_space and not crs.is_geographic and not crs.is_projected:
+        ground = _transformed(flat, crs, source, axes_of_crs)
+        return Ground(ground, 0.0, _of_three_axes(crs, source))
+    own = horizontal(crs.to_wkt())
+    ground = _transformed(flat * [1.0, 1.0, 0.0], own, source, axes_of_crs)
+    middle = np.median(ground[:, :2], axis=0) if len(ground) else np.zeros(2)
+    shift = datum_shift(crs.to_wkt(), np.array(from_wgs84(crs.to_wkt()).transform(*middle)), source)
+    of_datum = (shift.statement(source),)
+    if in_space:
+        ground = _without(_transformed(flat, crs, source, axes_of_crs), np.isnan(height))
+        return Ground(ground, shift.sigma_m, of_datum + _of_three_axes(crs, source)[1:])
+    if np.isnan(height).all():
+        return Ground(_without(ground, np.isnan(height)), shift.sigma_m, of_datum)
+    datum = _height_datum(crs, shift, middle, heights, source)
+    zero_m = 0.0 if datum.zero_m is None else datum.zero_m(ground[:, :2])
+    ground[:, 2] = zero_m + datum.unit_m * height
+    unknown = np.isnan(zero_m) & np.isfinite(height)
+    if unknown.any():
+        lon, lat = ground[unknown][0, :2]
+        raise VerticalDatumError(
+            f"{source}: the geoid of {heights or crs.name} is unknown at {int(unknown.sum())} of "
+            f"{len(ground)} points, such as longitude {lon:.4f}, latitude {lat:.4f}; take the datum of "
+            "that region"
+        )
+    return Ground(ground, shift.sigma_m, of_datum + datum.statements)
+
+
+def _height_datum(
+    crs: CRS, shift: DatumShift, middle: Array, heights: Heights | None, source: str
+) -> HeightDatum:
+    """Unit and datum of heights that a reference system or the caller states; else they are metres."""
+    if heights is None and not crs.is_compound:
         raise VerticalDatumError(
             f"{source}: the file does not state the datum of its heights; state it (--vertical): "
             f"{ELLIPSOID!r} or a vertical reference system such as 'EGM96' or 'EPSG:3855' (EGM2008), or "
             "the grid file of a geoid (--geoid)"
         )
+    vertical, grid = (None, heights) if isinstance(heights, Path) else (heights, None)
+    caller = HeightsByCaller(vertical, grid)
     try:
-        vertical = None if isinstance(heights, Path) else vertical_crs(heights)
-        if isinstance(heights, str) and vertical is None:
-            return _transformed(coordinates, crs.to_3d(), source, axes_of_crs)
-        if vertical is not None and vertical.axis_info[0].unit_conversion_factor != 1.0:
-            raise VerticalDatumError(
-                f"heights of this file are metres, those of {vertical.name} are "
-                f"{vertical.axis_info[0].unit_name}: state the datum in metres"
-            )
-        ground = _transformed(coordinates * [1.0, 1.0, 0.0], crs, source, axes_of_crs)
-        geoid = geoid_of_grid(Path(heights)) if vertical is None else geoid_of_crs(vertical)
+        if caller.vertical is not None and not crs.is_compound:
+            _check_metres(caller.vertical)
+        datum = height_datum(crs, shift, middle, caller, source)
     except MissingGeoid as error:
         raise MissingGeoid(f"{source}: {error} (--geoid, or --control-geoid for control)") from None
     except VerticalDatumError as error:
-        raise VerticalDatumError(f"{source}: {error}") from None
-    zero_m = geoid(ground[:, :2])
-    unknown = np.isnan(zero_m)
-    if unknown.any():
-        lon, lat = ground[unknown][0, :2]
+        text = str(error)
+        raise VerticalDatumError(text if text.startswith(source) else f"{source}: {text}") from None
+    if crs.is_compound:
+        return datum
+    of_datum = [one for one in datum.statements if one.subject is not Subject.UNIT]
+    return replace(datum, statements=tuple(of_datum))
+
+
+def _check_metres(heights: str) -> None:
+    vertical = vertical_crs(heights)
+    if vertical is not None and vertical.axis_info[0].unit_conversion_factor != 1.0:
         raise VerticalDatumError(
-            f"{source}: the geoid of {heights} is unknown at {int(unknown.sum())} of {len(ground)} "
-            f"points, such as longitude {lon:.4f}, latitude {lat:.4f}; take the datum of that region"
+            f"heights of this file are metres, those of {vertical.name} are "
+            f"{vertical.axis_info[0].unit_name}: state the datum in metres"
         )
-    return np.column_stack([ground[:, :2], zero_m + coordinates[:, 2]])
+
+
+def _of_three_axes(crs: CRS, source: str) -> Statements:
+    """What a reference system with three axes states; its transformation is that of space."""
+    where = "reference system"
+    horizontal_datum = Statement(source, Subject.HORIZONTAL_DATUM, Use.USED, crs.name, where)
+    vertical = replace(horizontal_datum, subject=Subject.VERTICAL_DATUM, value="its own ellipsoid")
+    unit = replace(horizontal_datum, subject=Subject.UNIT, value=crs.axis_info[2].unit_name)
+    return horizontal_datum, vertical, unit
+
+
+def _without(ground: Array, missing: BoolArray) -> Array:
+    return np.column_stack([ground[:, :2], np.where(missing, np.nan, ground[:, 2])])
 
 
 def horizontal_unit_m(crs: CRS) -> float:
@@ -186,7 +260,7 @@ def _transformed(coordinates: Array, crs: CRS, source: str, axes_of_crs: bool) -
     """Points (n, 3) in WGS 84, by a transformation of PROJ that is never approximate."""
     try:
         transformer = Transformer.from_crs(
-            crs, WGS84_3D, always_xy=not axes_of_crs, allow_ballpark=False, only_best=True
+            crs, WGS84_3D, always_xy=not axes_of_crs, allow_ballpark=False
         )
         x, y, z = transformer.transform(
             coordinates[:, 0], coordinates[:, 1], coordinates[:, 2], errcheck=True

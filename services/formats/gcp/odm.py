@@ -7,12 +7,11 @@ positions from the image centre: the centre of the first pixel is (0, 0).
 import math
 import re
 
-import numpy as np
 from pyproj import CRS
 
 from amers.services.errors import FormatError
 from amers.services.formats.gcp.marked_points import (
-    ELLIPSOID,
+    Ground,
     Heights,
     MarkedPoints,
     horizontal_unit_m,
@@ -109,16 +108,12 @@ def _height(field: str, where: str) -> float:
 
 def _ground(
     coordinates: list[tuple[float, float, float]], crs: CRS, heights: Heights | None, source: str
-) -> np.ndarray:
-    """Points (n, 3) in WGS 84; points without a height have none here, and need no vertical datum."""
+) -> Ground:
+    """Points in WGS 84; points without a height have none here, and need no vertical datum."""
     points = coordinate_array(coordinates)
     if len(crs.axis_info) < 3:
         points[:, 2] *= horizontal_unit_m(crs)
-    missing = np.isnan(points[:, 2])
-    datum = ELLIPSOID if missing.all() else heights
-    ground = to_wgs84(np.nan_to_num(points, nan=0.0), crs, datum, source)
-    ground[missing, 2] = np.nan
-    return ground
+    return to_wgs84(points, crs, heights, source)
 
 
 def _crs(line: str, source: str) -> CRS:

@@ -97,11 +97,9 @@ def parse_pci_text(text: str, heights: Heights | None = None, source: str = "PCI
     coordinates = coordinate_array([(row.number("X"), row.number("Y"), row.number("Z")) for row in rows])
     pixels = [(row.number("L") - PCI_CORNER_PX, row.number("P") - PCI_CORNER_PX) for row in rows]
     crs = parse_crs(definition, source)
-    if "Z" in columns:
-        ground = to_wgs84(coordinates, crs, stated_heights or heights, source)
-    else:
-        ground = to_wgs84(np.nan_to_num(coordinates, nan=0.0), crs.to_2d(), ELLIPSOID, source)
-        ground[:, 2] = np.nan
+    if "Z" not in columns:
+        crs = crs.to_2d()
+    ground = to_wgs84(coordinates, crs, stated_heights or heights, source)
     return marked_points(
         [row.fields["ID"] for row in rows] if "ID" in columns else sequential_ids(pixels),
         ground,

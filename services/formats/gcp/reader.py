@@ -1,11 +1,13 @@
 """Reading files of marked points and of ground points in any supported format."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from amers.services.datums import filled_sigmas
 from amers.services.errors import FormatError, InputError, VerticalDatumError
 from amers.services.formats.gcp.copernicus import COPERNICUS_KEY, parse_copernicus
 from amers.services.formats.gcp.csv_points import PIXEL_ORIGINS, CsvLayout, is_csv, parse_csv
@@ -68,7 +70,12 @@ def read_control_points(path: Path, heights: Heights | None = None) -> MarkedPoi
     """
     points = _read(path, StatedByCaller(heights))
     _refuse_unmarked(points, path)
-    return points.take(points.is_marked)
+    marked = points.take(points.is_marked)
+    if marked.datum_sigma_m == 0.0:
+        return marked
+    # An unknown sigma counts as none, but the datum is known no better.
+    sigma_m = filled_sigmas(marked.sigma_m, (0.0, math.nan), marked.datum_sigma_m)
+    return replace(marked, sigma_m=sigma_m)
 
 
 def _refuse_unmarked(points: MarkedPoints, path: Path) -> None:
@@ -110,7 +117,9 @@ def read_ground_points(path: Path, stated: StatedByCaller = StatedByCaller()) ->
     """
     used = _used(_read(path, stated), path)
     rows = np.sort(np.unique(used.id, return_index=True)[1])
-    return GroundPoints(used.id[rows], used.lon_lat_h[rows], used.sigma_m[rows], used.statements)
+    return GroundPoints(
+        used.id[rows], used.lon_lat_h[rows], used.sigma_m[rows], used.statements, used.datum_sigma_m
+    )
 
 
 def _used(marks: MarkedPoints, path: Path) -> MarkedPoints:

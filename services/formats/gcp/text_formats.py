@@ -10,7 +10,6 @@ from pyproj import CRS
 
 from amers.services.errors import FormatError, InputError
 from amers.services.formats.gcp.marked_points import (
-    ELLIPSOID,
     WGS84_3D,
     Heights,
     MarkedPoints,
@@ -218,11 +217,10 @@ def parse_qgis_points(text: str, source: str = "points file") -> MarkedPoints:
         if len(fields) < 5:
             raise FormatError(f"{where}: expected at least 5 fields, found {len(fields)}")
         x, y, column, minus_row = parse_numbers(fields[:4], _QGIS_COLUMNS, where)
-        coordinates.append((x, y, 0.0))
+        coordinates.append((x, y, math.nan))
         pixels.append((-minus_row - QGIS_CORNER_PX, column - QGIS_CORNER_PX))
         active.append(fields[4].strip() != "0")
-    ground = to_wgs84(coordinate_array(coordinates), crs.to_2d(), ELLIPSOID, source)
-    ground[:, 2] = np.nan
+    ground = to_wgs84(coordinate_array(coordinates), crs.to_2d(), None, source)
     return marked_points(sequential_ids(pixels), ground, pixels, active=active)
 
 
@@ -273,12 +271,10 @@ def parse_envi_pts(
         if len(fields) != len(names):
             raise FormatError(f"{where}: expected {', '.join(names)}, found {len(fields)} fields")
         values = dict(zip(names, parse_numbers(fields, names, where), strict=True))
-        coordinates.append((values["map x"], values["map y"], values.get("elevation", 0.0)))
+        coordinates.append((values["map x"], values["map y"], values.get("elevation", math.nan)))
         pixels.append((values["image y"] - ENVI_CORNER_PX, values["image x"] - ENVI_CORNER_PX))
     points = coordinate_array(coordinates)
-    ground = to_wgs84(points, crs, heights if "elevation" in names else ELLIPSOID, source)
-    if "elevation" not in names:
-        ground[:, 2] = np.nan
+    ground = to_wgs84(points, crs, heights, source)
     return marked_points(sequential_ids(pixels), ground, pixels)
 
 
