@@ -80,6 +80,9 @@ class Terrain:
         Raises:
             CoverageError: no position lies on the grid.
         """
+        seamless = self.seamless(lon_lat)
+        if seamless is not self:
+            return seamless.around(lon_lat)
         position = self.grid.line_sample(lon_lat)
         position = position[np.isfinite(position).all(axis=1)]
         last = np.array(self.grid.shape) - 1
@@ -101,6 +104,30 @@ class Terrain:
         origin_xy = self.grid.xy(low[None, :].astype(np.float64))[0]
         grid = replace(self.grid, origin_xy=origin_xy, shape=(lines, samples))
         return replace(self, grid=grid, heights=heights)
+
+    def seamless(self, lon_lat: Array) -> "Terrain":
+        """The same terrain; one around the Earth begins where its seam is not among positions (n, 2)."""
+        along = self.grid.step_xy[0, 1]
+        if not self.grid.is_geographic or along == 0.0 or self.grid.step_xy[1, 1] != 0.0:
+            return self
+        period = round(360.0 / abs(along))
+        if self.grid.shape[1] < period:
+            return self
+        samples = self.grid.line_sample(lon_lat)[:, 1]
+        on_circle = np.sort(samples[np.isfinite(samples)] % period)
+        if not len(on_circle) or np.ptp(on_circle) <= period / 2.0:
+            return self
+        # The new seam is in the middle of the widest gap, on the other side of the Earth.
+        gaps = np.diff(on_circle)
+        widest = int(gaps.argmax())
+        return self._rolled(int(on_circle[widest] + gaps[widest] / 2.0), period)
+
+    def _rolled(self, first: int, period: int) -> "Terrain":
+        """The same terrain around the Earth, which begins at another column."""
+        origin_xy = self.grid.xy(np.array([[0.0, float(first)]]))[0]
+        shape = (self.grid.shape[0], period)
+        grid = replace(self.grid, origin_xy=origin_xy, shape=shape)
+        return replace(self, grid=grid, heights=_RolledImage(self.heights, first, shape))
 
     def range_m(self) -> tuple[float, float]:
         """Lowest and highest ground, metres above the ellipsoid; bounds of them where there is a geoid.
@@ -181,6 +208,28 @@ class _CroppedImage:
     def read(self, window: Window) -> FloatImage:
         line, sample = window.line + self.window.line, window.sample + self.window.sample
         return self.whole.read(Window(line, sample, window.lines, window.samples))
+
+
+@dataclass(frozen=True)
+class _RolledImage:
+    """An image around the Earth, as an `ImageSource` that begins at another column."""
+
+    whole: ImageSource
+    first: int
+    shape: tuple[int, int]
+
+    def read(self, window: Window) -> FloatImage:
+        out = np.full((window.lines, window.samples), np.nan, dtype=np.float32)
+        period = self.shape[1]
+        at = max(window.sample, 0)
+        end = min(window.sample + window.samples, period)
+        while at < end:
+            column = (at + self.first) % period
+            samples = min(end - at, period - column)
+            part = self.whole.read(Window(window.line, column, window.lines, samples))
+            out[:, at - window.sample : at - window.sample + samples] = part
+            at += samples
+        return out
 
 
 @njit(cache=True)

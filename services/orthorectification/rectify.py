@@ -181,6 +181,7 @@ def orthorectify(
     Raises:
         ComputationError: positions exceed the tolerance.
     """
+    terrain = terrain.seamless(grid.lon_lat(_grid_over(grid.shape)))
     task = _Task(images, model, terrain, grid, options, _ratio(model, grid, images[0].shape))
     lines, samples = grid.shape
     side = options.window_px

@@ -254,3 +254,27 @@ def test_the_lines_of_sight_of_an_ortho_image_end_vertically_below() -> None:
     model, ground = OrthoModel(GRID), terrain()
     met = intersect_terrain(model, places(), ground)
     np.testing.assert_allclose(met[:, 2], ground.height_m(GRID.lon_lat(places())), atol=a_millimetre)
+
+
+@pytest.mark.parametrize("west", [-180.0, 0.0, -170.0])
+@pytest.mark.parametrize("columns", [3600, 3601])
+@pytest.mark.parametrize("middle", [180.0, -180.0, 0.0, 5.0, -170.0])
+def test_a_terrain_around_the_earth_serves_ground_on_both_sides_of_its_seam(
+    west: float, columns: int, middle: float
+) -> None:
+    """Columns of 0.1 degrees; with one more, the last is the first again."""
+    step = np.array([[0.0, 0.1], [-0.1, 0.0]])
+    grid = MapGrid("EPSG:4326", np.array([west + 0.05, 10.0]), step, (20, columns))
+    lon = west + 0.05 + 0.1 * np.arange(columns)
+    pixels = np.tile(100.0 * np.cos(np.radians(lon)), (20, 1)).astype(np.float32)
+    terrain = Terrain(grid, ArrayImage(pixels))
+    lon_lat = np.column_stack([middle + np.linspace(-0.5, 0.5, 41), np.full(41, 9.3)])
+    lon_lat[:, 0] = (lon_lat[:, 0] + 180.0) % 360.0 - 180.0
+    around = terrain.around(lon_lat)
+    assert around.grid.shape[1] <= 14
+    expected = 100.0 * np.cos(np.radians(lon_lat[:, 0]))
+    a_cell_of_the_cosine_m = 0.05
+    np.testing.assert_allclose(around.height_m(lon_lat), expected, atol=a_cell_of_the_cosine_m)
+    low, high = around.range_m()
+    assert low <= expected.min() + a_cell_of_the_cosine_m
+    assert high >= expected.max() - a_cell_of_the_cosine_m
