@@ -172,11 +172,12 @@ def open_scene(
     sigma_m: float | None = None,
     bands: str | None = None,
     mask: FilePath | None = None,
+    crop_origin: tuple[float, float] | None = None,
 ) -> Scene:
     """The scene of an image file. An image with a map grid and without a model is an ortho-image.
 
     Args:
-        image: GeoTIFF, JPEG 2000 or NITF.
+        image: GeoTIFF, JPEG 2000 or NITF; or a product in tiles: its `DIM_….XML`, `.TIL` or folder.
         model: file of its model. By default it is in the image, or beside it under the name that its
             format gives it.
         sigma_m: horizontal accuracy of the model, one standard deviation of each coordinate, metres. A
@@ -185,6 +186,8 @@ def open_scene(
         bands: numbers of the bands to use with their weights, such as "1" or "1,2,3". By default the
             panchromatic band, or the mean of the visible bands.
         mask: image of the same ground; pixels are not used where it is not zero. By default all are.
+        crop_origin: line and sample of the image's first pixel in the image that the model is for. By
+            default as the files state it.
 
     Raises:
         InputError: the image, its model or its mask cannot be used.
@@ -195,9 +198,17 @@ def open_scene(
         sigma_m,
         bands,
         None if mask is None else Path(mask),
+        crop_origin=crop_origin,
     )
     mix = None if bands is None else parse_bands(bands)
-    content = read_scene(files.image, files.model, sigma_m=sigma_m, bands=mix, mask=files.mask)
+    content = read_scene(
+        files.image,
+        files.model,
+        sigma_m=sigma_m,
+        bands=mix,
+        mask=files.mask,
+        crop_origin=crop_origin,
+    )
     return Scene(files, content)
 
 

@@ -47,6 +47,7 @@ from amers.opened import (
     rows_of,
 )
 from amers.services.errors import AmersError, InputError
+from amers.services.formats.sensor_models.rpc_files import ImageFiles
 from amers.services.formats.vector.pixel_coordinates import PixelOrigin
 from amers.services.misfit.affine_fit import Order
 from amers.services.orthorectification.rectify import OrthoOptions
@@ -338,10 +339,9 @@ def orthorectify(
     """
     files = _files_of(scene)
     return run_orthorectification(
-        files.image,
+        ImageFiles(files.image, files.model, files.crop_origin),
         _terrain_file(terrain),
         Path(output),
-        model=files.model,
         ortho_map=OrthoMap(crs, gsd_m),
         options=OrthoOptions(hide=hide),
         progress=progress,

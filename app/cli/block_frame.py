@@ -12,6 +12,7 @@ from amers.app.cli.progress import shown_progress
 from amers.app.errors import InputError
 from amers.app.usecases.blocks.frame import PlacedBlock, place_block
 from amers.app.usecases.control_files import ControlFiles
+from amers.app.usecases.model_choice import ModelChoice
 
 
 def frame(
@@ -24,6 +25,7 @@ def frame(
             "--images", exists=True, help="Image of the block, in which control is found; repeat."
         ),
     ],
+    models: ModelChoice,
     version: Annotated[
         str, typer.Option(help="Version of the moved block; by default the next whole number.")
     ] = "",
@@ -54,6 +56,7 @@ def frame(
             output,
             check=None if not check else ControlFiles(tuple(check), control.points),
             version=version,
+            models=models,
             progress=progress,
         )
     show_one(

@@ -18,6 +18,7 @@ from amers.app.usecases.executors import ComputeOptions
 from amers.app.usecases.ground_classes import GroundFiles
 from amers.app.usecases.image_production import ProductionImages, WorkPlace, run_image_production
 from amers.app.usecases.image_selection import CatalogueRequest, run_selection
+from amers.app.usecases.model_choice import ModelChoice
 from amers.app.usecases.new_block import BlockIdentity, refuse_existing
 from amers.services.formats.addresses import file_place
 from amers.services.production.image_production import Production, ProductionOptions
@@ -99,6 +100,7 @@ class WorkOptions:
 def run(
     *,
     images: ImageOptions,
+    models: ModelChoice,
     output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the block.")],
     identity: BlockIdentity,
     gsd_m: Annotated[str, typer.Option(help="Ground sampling of the chips: FINE,COARSE, metres.")] = (
@@ -127,7 +129,12 @@ def run(
         selection = images.selected(output, part_of(progress, 0.0, _SHARE_OF_SELECTION))
         production = run_image_production(
             ProductionImages(
-                tuple(map(file_place, images.images)), selection, images.sigma_m, control_files, ground
+                tuple(map(file_place, images.images)),
+                selection,
+                images.sigma_m,
+                control_files,
+                ground,
+                models,
             ),
             output,
             identity.named_after(output),

@@ -28,6 +28,7 @@ from amers.app.usecases.registration.together import (
     JointPlace,
     run_joint_registration,
 )
+from amers.services.formats.images.scenes import scene_name
 from amers.services.quality.qualification import QualificationOptions
 from amers.services.registration.options import RegistrationOptions
 from amers.services.reports.document import report_document
@@ -77,7 +78,7 @@ class JointRequest:
 
     def scene(self, files: SceneFiles) -> SceneRequest:
         """One of the scenes, as it is asked for alone."""
-        folder = self.output / files.image.stem
+        folder = self.output / scene_name(files.image)
         return SceneRequest(files, folder, self.copy_image, self.command, self.max_ce90_on_earth_m)
 
 
@@ -87,7 +88,7 @@ def register_together(request: JointRequest) -> tuple[list[Outcome], dict[str, A
     Raises:
         InputError: a folder cannot be written, or nothing could be begun.
     """
-    names = [one.image.stem for one in request.files]
+    names = [scene_name(one.image) for one in request.files]
     if BLOCK_FOLDER in names:
         raise InputError(
             f"{BLOCK_FOLDER}: the folder of this name holds the report on all scenes; rename the image"
@@ -114,7 +115,7 @@ def register_together(request: JointRequest) -> tuple[list[Outcome], dict[str, A
             return [_failed(request, files, error) for files in request.files], {}
     outcomes = []
     for files in request.files:
-        name = files.image.stem
+        name = scene_name(files.image)
         if name in outcome.registered:
             document = report_document(outcome.registered[name].report)
             outcomes.append(registered_outcome(request.scene(files), document))
@@ -132,7 +133,7 @@ def register_together(request: JointRequest) -> tuple[list[Outcome], dict[str, A
 
 
 def _failed(request: JointRequest, files: SceneFiles, error: AmersError) -> Outcome:
-    folder = request.output / files.image.stem
+    folder = request.output / scene_name(files.image)
     return {**failed_outcome(request.scene(files), error), "output": folder}
 
 
@@ -150,7 +151,7 @@ def _control(request: JointRequest) -> Iterator[tuple[FindPoints, Database | Non
 def _run(request: JointRequest, find_points: FindPoints, folders: dict[str, Path]) -> JointOutcome:
     with shown_progress() as progress:
         return run_joint_registration(
-            {one.image.stem: one for one in request.files},
+            {scene_name(one.image): one for one in request.files},
             find_points,
             JointPlace(
                 folders.__getitem__,
@@ -169,6 +170,6 @@ def _record(database: Database, request: JointRequest, outcome: JointOutcome) ->
     """Store the registrations, all in one transaction."""
     with database.transaction() as connection:
         for files in request.files:
-            registered = outcome.registered.get(files.image.stem)
+            registered = outcome.registered.get(scene_name(files.image))
             if registered is not None:
                 record_registration(connection, registered, image_key(files.image))

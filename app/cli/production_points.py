@@ -11,6 +11,7 @@ from amers.app.cli.output import AsJson, show_one
 from amers.app.cli.point_statements import sigma_pair, stated_by_caller
 from amers.app.cli.production_rows import accuracy_row, agreement_row, sampling_pair
 from amers.app.cli.progress import shown_progress
+from amers.app.usecases.model_choice import ModelChoice
 from amers.app.usecases.new_block import BlockIdentity
 from amers.app.usecases.points_production import KnownPointFiles, run_points_production
 from amers.app.usecases.terrain_file import TerrainFile
@@ -70,6 +71,7 @@ def points(
     *,
     output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the block.")],
     files: Files,
+    models: ModelChoice,
     stated: StatementOptions,
     identity: BlockIdentity,
     gsd_m: Annotated[
@@ -90,6 +92,7 @@ def points(
         ),
         point_sigma_m=sigma_pair(stated.point_sigma_m, "--point-sigma-m"),
         terrain=stated.terrain,
+        models=models,
     )
     identity = identity.named_after(output)
     with shown_progress() as progress:

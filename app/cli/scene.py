@@ -25,9 +25,11 @@ from amers.app.cli.scene_rows import (
     write_overview,
 )
 from amers.app.errors import InputError
+from amers.app.usecases.model_choice import CropOrigin, ModelChoice
 from amers.app.usecases.registration.reference_source import ReferenceFiles, check_map
 from amers.app.usecases.registration.register import SceneFiles
 from amers.app.usecases.terrain_file import TerrainFile
+from amers.services.formats.images.scenes import scene_name
 
 
 @dataclass(frozen=True)
@@ -77,14 +79,12 @@ class SceneOptions:
     """How scenes are read.
 
     Attributes:
-        model: file of the model; by default it is found by its name.
         bands: bands to use: 2, or 1,2,3 for their mean, or 3:0.3,2:0.7.
         mask: image of the same ground; pixels that are not 0 are not used.
         check_points: points held out: ASP, QGIS, ENVI, ODM, PCI, GeoJSON or OPF.
         check_heights: vertical datum of the check points, if not in the file: ellipsoid, EPSG:…
     """
 
-    model: Path | None = None
     bands: str | None = None
     mask: Path | None = None
     check_points: Path | None = None
@@ -93,13 +93,22 @@ class SceneOptions:
     @property
     def files_of_one(self) -> list[str]:
         """The options given whose file belongs to one scene."""
-        files = {"--model": self.model, "--mask": self.mask, "--check-points": self.check_points}
+        files = {"--mask": self.mask, "--check-points": self.check_points}
         return [name for name, file in files.items() if file is not None]
 
-    def of(self, image: Path, sigma_m: float | None) -> SceneFiles:
+    def of(
+        self, image: Path, model: tuple[Path | None, CropOrigin | None], sigma_m: float | None
+    ) -> SceneFiles:
         """The files of one scene."""
         return SceneFiles(
-            image, self.model, sigma_m, self.bands, self.mask, self.check_points, self.check_heights
+            image,
+            model[0],
+            sigma_m,
+            self.bands,
+            self.mask,
+            self.check_points,
+            self.check_heights,
+            crop_origin=model[1],
         )
 
 
@@ -162,6 +171,7 @@ def register(
     sigma_m: Annotated[
         float | None, typer.Option(help="Accuracy of the model, one sigma, metres.", min=0.01)
     ] = None,
+    models: ModelChoice,
     options: SceneOptions,
     result: ResultOptions,
     work: WorkOptions,
@@ -179,16 +189,17 @@ def register(
     remote = work.remote(control)
     refuse_shared_files(images, options.files_of_one)
     control_files = control.files()
-    repeated = [*words_of(options), *words_of(control)]
+    models_of = models.of(images)
+    repeated = [*words_of(models), *words_of(options), *words_of(control)]
     repeated += [] if work.server is None else ["--server", work.server]
     requests = []
     for image in images:
-        folder = result.output if is_one_scene else result.output / image.stem
+        folder = result.output if is_one_scene else result.output / scene_name(image)
         # Without the accuracy of the model, which the report of a failure advises to state anew.
         command = shlex.join(["amers", "scene", "register", str(image), *repeated, "-o", str(folder)])
         requests.append(
             SceneRequest(
-                options.of(image, sigma_m),
+                options.of(image, models_of[image], sigma_m),
                 folder,
                 result.copy_image,
                 command,

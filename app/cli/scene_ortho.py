@@ -11,7 +11,9 @@ from amers.app.cli.output import AsJson, show_one
 from amers.app.cli.progress import shown_progress
 from amers.app.cli.terrain_options import Terrain
 from amers.app.errors import InputError
+from amers.app.usecases.model_choice import ModelChoice
 from amers.app.usecases.orthorectification import OrthoMap, run_orthorectification
+from amers.services.formats.sensor_models.rpc_files import ImageFiles
 from amers.services.orthorectification.rectify import OrthoOptions
 
 Options = Annotated[OrthoOptions, Shown(tolerance_px=typer.Option(min=1e-4), hide=None)]
@@ -22,12 +24,7 @@ def ortho(
     *,
     terrain: Terrain,
     output: Annotated[Path, typer.Option("-o", "--output", help="GeoTIFF to write.")],
-    model: Annotated[
-        Path | None,
-        typer.Option(
-            exists=True, help="File of the model, such as a refined one; by default found by its name."
-        ),
-    ] = None,
+    models: ModelChoice,
     ortho_map: Annotated[OrthoMap, Shown(crs=None, gsd_m=typer.Option(min=0.001))],
     kernel: Annotated[str, typer.Option(help="Interpolation: cubic or bilinear.")] = "cubic",
     options: Options,
@@ -36,12 +33,12 @@ def ortho(
     """Orthorectify a scene through its model and a terrain into a cloud-optimised GeoTIFF."""
     if kernel not in ("cubic", "bilinear"):
         raise InputError(f"--kernel: {kernel} found, cubic or bilinear expected")
+    model, crop_origin = models.of([scene])[scene]
     with shown_progress() as progress:
         orthorectified = run_orthorectification(
-            scene,
+            ImageFiles(scene, model, crop_origin),
             terrain,
             output,
-            model=model,
             ortho_map=ortho_map,
             options=replace(options, kernel="cubic" if kernel == "cubic" else "bilinear"),
             progress=progress,

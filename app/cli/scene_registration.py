@@ -37,8 +37,8 @@ from amers.app.usecases.registration.register import (
 )
 from amers.app.usecases.registration.result_folder import older_result, replacing
 from amers.app.usecases.report_files import REPORT_FILES
-from amers.app.usecases.uploads import IMAGE_SUFFIXES
 from amers.app.worker.warm_process import WarmProcess, WarmServer
+from amers.services.formats.sensor_models.product_image import IMAGE_SUFFIXES, scenes_in
 from amers.services.quality.accuracy_statement import accuracy_document
 from amers.services.quality.qualification import QualificationOptions
 from amers.services.registration.options import RegistrationOptions
@@ -112,7 +112,7 @@ def images_of(paths: Sequence[Path]) -> list[Path]:
         if not path.is_dir():
             images.append(path)
             continue
-        inside = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+        inside = scenes_in(path)
         if not inside:
             raise InputError(f"{path}: no image ({', '.join(IMAGE_SUFFIXES)}) in this folder")
         images.extend(inside)

@@ -13,6 +13,7 @@ from amers.app.cli.exit_status import SUCCESS
 from amers.app.cli.output import print_json, show, show_one, show_statements
 from amers.app.cli.scene_registration import Outcome
 from amers.app.errors import InputError
+from amers.services.formats.images.scenes import scene_name
 from amers.services.quality.accuracy_statement import ON_THE_EARTH, RELATIVE
 from amers.services.reports.overview import OverviewRow, format_overview
 
@@ -30,7 +31,7 @@ def refuse_shared_files(scenes: list[Path], files_of_one: list[str]) -> None:
         raise InputError(
             f"{', '.join(files_of_one)}: belongs to one scene, but {len(scenes)} scenes are given"
         )
-    names = [scene.stem for scene in scenes]
+    names = [scene_name(scene) for scene in scenes]
     if len(set(names)) < len(names):
         raise InputError(
             "several scenes of the same name would write into the same folder; register them separately"

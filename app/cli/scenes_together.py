@@ -11,6 +11,7 @@ from amers.app.cli.options import FromCenti, FromMilli
 from amers.app.cli.output import AsJson, print_json, show_one
 from amers.app.cli.scene_registration import images_of, worst_status
 from amers.app.cli.scene_rows import refuse_shared_files, show_failures, show_outcomes
+from amers.app.usecases.model_choice import ModelChoice
 from amers.app.usecases.registration.register import SceneFiles
 from amers.services.sensors.parameter_sets import parameter_set_named
 
@@ -45,6 +46,7 @@ def register_many(
         list[Path], typer.Argument(help="GeoTIFF, JPEG 2000 or NITF, or folders of such images.")
     ],
     *,
+    models: ModelChoice,
     options: JointOptions,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Folder; each scene gets one inside it.")
@@ -65,8 +67,10 @@ def register_many(
     refuse_shared_files(images, [])
     request = JointRequest(
         files=[
-            SceneFiles(image, None, options.sigma_m, options.bands, rigorous=rigorous)
-            for image in images
+            SceneFiles(
+                image, model, options.sigma_m, options.bands, rigorous=rigorous, crop_origin=origin
+            )
+            for image, (model, origin) in models.of(images).items()
         ],
         output=output,
         block=options.block,

@@ -33,6 +33,7 @@ VertexFile = Annotated[
     Path | None, typer.Option(help="Also write every vertex as a point, with its accuracy.")
 ]
 _SCENE = {"image": typer.Option("--scene", exists=True), "registration": None, "model": None}
+_SCENE["crop_origin"] = None
 _OPTIONS = {"tolerance_px": typer.Option(min=0.001), "skip_missed": None}
 _POSITIVE = typer.Option(min=0.0)
 

@@ -16,6 +16,7 @@ from amers.app.usecases.control_files import IMAGES_NPZ, ControlFiles, control_i
 from amers.app.usecases.executors import ComputeOptions, open_executor
 from amers.app.usecases.ground_classes import GroundFiles, read_ground
 from amers.app.usecases.image_selection import ITEMS
+from amers.app.usecases.model_choice import ModelChoice
 from amers.app.usecases.new_block import BlockIdentity, block_metadata, points_per_km2, refuse_existing
 from amers.app.usecases.registration.result_folder import older_result, replacing
 from amers.app.usecases.report_files import write_report
@@ -50,6 +51,7 @@ class ProductionImages:
         sigma_m: accuracy of the images' models, metres; by default that of the producer or the sensor.
         control: places the block on the Earth.
         ground: where no points are wanted, and what points stand on.
+        models: of the files whose names and tags do not give them.
     """
 
     files: tuple[FilePlace, ...] = ()
@@ -57,6 +59,7 @@ class ProductionImages:
     sigma_m: float | None = None
     control: ControlFiles = field(default_factory=ControlFiles)
     ground: GroundFiles = field(default_factory=GroundFiles)
+    models: ModelChoice = field(default_factory=ModelChoice)
 
 
 @dataclass(frozen=True)
@@ -159,8 +162,10 @@ def _read(
         stack.callback(scene.image.close)  # type: ignore[attr-defined]
         scenes.append(scene)
 
+    chosen_models = images.models.of([path for path in images.files if isinstance(path, Path)])
     for path in images.files:
-        add(read_scene(path, sigma_m=images.sigma_m))
+        model, origin = chosen_models[path] if isinstance(path, Path) else (None, None)
+        add(read_scene(path, model, sigma_m=images.sigma_m, crop_origin=origin))
     if images.selection is not None:
         source = images.selection / ITEMS
         chosen = read_catalogue(str(source), elsewhere=True)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -43,6 +43,8 @@ from amers.services.formats.images.bands import one_band
 from amers.services.formats.images.ortho import write_cog
 from amers.services.formats.images.raster import RasterImage
 from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.images.tiled_image import SceneImage, TiledImage
+from amers.services.formats.sensor_models.rpc_files import ImageFiles
 from amers.services.imagery.scene import Scene, scene_gsd_m
 from amers.services.map_grid import MapGrid, check_map_code
 from amers.services.orthorectification.rectify import (
@@ -197,11 +199,10 @@ _DEFAULT_OPTIONS = OrthoOptions()
 
 
 def run_orthorectification(
-    image: Path,
+    source: ImageFiles,
     terrain: TerrainFile,
     output: Path,
     *,
-    model: Path | None = None,
     ortho_map: OrthoMap = _DEFAULT_MAP,
     options: OrthoOptions = _DEFAULT_OPTIONS,
     limits: MapLimits | None = None,
@@ -212,10 +213,9 @@ def run_orthorectification(
     Pixels of 8 or 16 bits and of 32-bit floating point keep their type; others become floating point.
 
     Args:
-        image: of the scene.
+        source: the files of the scene.
         terrain: the ground.
         output: path of the ortho-image; an existing file is replaced.
-        model: file of the scene's model; None finds it by its name.
         ortho_map: reference system and ground sampling.
         options: of the orthorectification.
         limits: of the map; None on the command line, which has none.
@@ -225,12 +225,12 @@ def run_orthorectification(
         InputError: the scene or the terrain cannot be used, or no pixel of the map shows the scene.
         ComputationError: the mapping exceeds the tolerance.
     """
-    _check_request(ortho_map, output, (image, terrain.dem))
-    scene = read_scene(image, model, sigma_m=1.0)
+    _check_request(ortho_map, output, (source.image, terrain.dem))
+    scene = read_scene(source.image, source.model, sigma_m=1.0, crop_origin=source.crop_origin)
     raster = scene.image
-    assert isinstance(raster, RasterImage)
+    assert isinstance(raster, RasterImage | TiledImage)
     ground = read_terrain(terrain)
-    bands = [replace(raster, mix=one_band(band)) for band in _data_bands(raster)]
+    bands = [raster.with_mix(one_band(band)) for band in _data_bands(raster)]
     grid = choose_grid(scene, ground, ortho_map.crs, ortho_map.gsd_m)
     dtype, nodata = _pixel_type(raster)
     if limits is not None:
@@ -265,7 +265,7 @@ def _check_request(ortho_map: OrthoMap, output: Path, inputs: Sequence[Path]) ->
         raise InputError(f"{output}: the output would replace an input file; choose another name")
 
 
-def _pixel_type(raster: RasterImage) -> tuple[str, float]:
+def _pixel_type(raster: SceneImage) -> tuple[str, float]:
     """The pixel type of the ortho-image of a scene, and its value for pixels without data."""
     dtype = raster.dataset.dtypes[0]
     if dtype not in _KEPT_TYPES:
@@ -291,7 +291,7 @@ class _DataPixels:
             raise self.of_none()
 
 
-def _data_bands(image: RasterImage) -> list[int]:
+def _data_bands(image: SceneImage) -> list[int]:
     """The numbers of the bands that are not an alpha band."""
     colours = [colour.name for colour in image.dataset.colorinterp]
     return [band for band, colour in enumerate(colours, start=1) if colour != "alpha"]
@@ -352,10 +352,9 @@ def _run(work: Work) -> Commit:
         files = [*stored_keys(scene), *([] if refined is None else [refined])]
         with suspecting_damage(work.database, work.storage, files):
             ortho = run_orthorectification(
-                image,
+                ImageFiles(image, model, None if refined is None else (0.0, 0.0)),
                 TerrainFile(image.with_name(inputs.dem), inputs.vertical, geoid, inputs.fill_px),
                 Path(folder) / ORTHO_NAME,
-                model=model,
                 ortho_map=inputs.map,
                 options=inputs.options,
                 limits=MapLimits(room),

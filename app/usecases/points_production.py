@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from amers.app.errors import InputError
+from amers.app.usecases.model_choice import ModelChoice
 from amers.app.usecases.new_block import (
     BlockIdentity,
     block_metadata,
@@ -54,6 +55,7 @@ class KnownPointFiles:
         frame_sigma_m: error that all points share, horizontal, one sigma, metres; by default unknown.
         frame_sigma_up_m: the same of their heights.
         bands: bands to use: 2, or 1,2,3, or 3:0.3,2:0.7.
+        models: of the images whose names and tags do not give them.
     """
 
     points: Path
@@ -68,6 +70,7 @@ class KnownPointFiles:
     frame_sigma_m: float | None = None
     frame_sigma_up_m: float | None = None
     bands: str | None = None
+    models: ModelChoice = field(default_factory=ModelChoice)
 
 
 def run_points_production(
@@ -103,8 +106,10 @@ def run_points_production(
         else:
             bands = None if files.bands is None else parse_bands(files.bands)
             scenes = []
-            for image in files.images:
-                scenes.append(read_scene(image, sigma_m=files.sigma_m, bands=bands))
+            for image, (model, origin) in files.models.of(files.images).items():
+                scenes.append(
+                    read_scene(image, model, sigma_m=files.sigma_m, bands=bands, crop_origin=origin)
+                )
                 stack.callback(scenes[-1].image.close)  # type: ignore[attr-defined]
             production = produce_known_points(ground, scenes, frame, options, make)
             stated = chain(ground.statements, *(scene.statements for scene in scenes))

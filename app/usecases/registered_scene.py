@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from amers.app.errors import InputError
+from amers.app.usecases.model_choice import parse_crop_origin
 from amers.services.formats.images.scenes import read_scene
 from amers.services.formats.sensor_models.correction_json import parse_correction_accuracy
 from amers.services.formats.sensor_models.refined_model import CORRECTION_JSON
@@ -27,12 +28,15 @@ class SceneModel:
         model: file of the delivered model; by default found by its name.
         registration: folder of the scene's registration (`amers scene register -o`).
         sigma_m: accuracy of a model that is not registered, one sigma, metres; by default unknown.
+        crop_origin: LINE,SAMPLE of the image's first pixel in the image that the model is for; by
+            default as stated by ICHIPB, .TIL, DIMAP or the geotransform.
     """
 
     image: Path
     model: Path | None = None
     registration: Path | None = None
     sigma_m: float | None = None
+    crop_origin: str | None = None
 
 
 def read_registered_scene(files: SceneModel) -> tuple[Scene, CorrectionAccuracy | None]:
@@ -48,7 +52,13 @@ def read_registered_scene(files: SceneModel) -> tuple[Scene, CorrectionAccuracy 
     accuracy = None if folder is None else _read_accuracy(folder)
     refined = None if folder is None or files.model is not None else folder / REFINED_NAME
     uses_refined = refined is not None and refined.is_file()
-    scene = read_scene(files.image, refined if uses_refined else files.model, sigma_m=1.0)
+    origin = None if files.crop_origin is None else parse_crop_origin(files.crop_origin)
+    scene = read_scene(
+        files.image,
+        refined if uses_refined else files.model,
+        sigma_m=1.0,
+        crop_origin=(0.0, 0.0) if uses_refined else origin,
+    )
     if folder is not None:
         _check_size(folder, scene)
     if accuracy is not None and not uses_refined:

@@ -40,8 +40,8 @@ from amers.services.formats.archives import (
     is_archive,
     unpack_archive,
 )
+from amers.services.formats.sensor_models.product_image import IMAGE_SUFFIXES
 
-IMAGE_SUFFIXES = (".tif", ".tiff", ".jp2", ".j2k", ".ntf", ".nitf")
 PURPOSES: tuple[UploadPurpose, ...] = ("image", "model", "block")
 UPLOAD_PREFIX = "upload-"
 """Beginning of the names of unfinished files of uploads in the scratch folder."""

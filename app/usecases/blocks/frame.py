@@ -12,6 +12,7 @@ import numpy as np
 
 from amers.app.errors import InputError
 from amers.app.usecases.control_files import ControlFiles, read_control
+from amers.app.usecases.model_choice import CropOrigin, ModelChoice
 from amers.app.usecases.new_block import refuse_existing
 from amers.services.adjustment.frame_fit import FrameFit, fit_frame, misfits_m
 from amers.services.formats.block.document import (
@@ -62,6 +63,9 @@ class PlacedBlock:
     statements: Statements = ()
 
 
+_FOUND = ModelChoice()
+
+
 def place_block(
     block: Path,
     images: Sequence[Path],
@@ -70,6 +74,7 @@ def place_block(
     *,
     check: ControlFiles | None = None,
     version: str = "",
+    models: ModelChoice = _FOUND,
     progress: Progress = no_progress,
 ) -> PlacedBlock:
     """Write a version of a block that is moved onto control; nothing of it is measured again.
@@ -81,6 +86,7 @@ def place_block(
         folder: of the new version; must not exist.
         check: known ground that takes no part, and measures the result.
         version: of the new version; by default the next whole number.
+        models: delivered ones of images whose names and tags do not give them.
         progress: receives the fraction done and a message.
 
     Raises:
@@ -91,9 +97,10 @@ def place_block(
     contents = read_block(block)
     points, document = contents.points, contents.document
     new_version = version or _next_version(document.metadata.version)
-    models = _models(block, document)
+    adjusted = _models(block, document)
+    delivered = models.of(images)
     with ExitStack() as stack:
-        scenes = [_scene(path, models, stack) for path in images]
+        scenes = [_scene(path, delivered[path], adjusted, stack) for path in images]
         stated = [scene.statements for scene in scenes]
 
         def find(files: ControlFiles, share: Progress) -> FoundControl:
@@ -119,7 +126,7 @@ def place_block(
             _metadata(contents, placed, new_version),
             moved,
             lambda row: _chips(chips, points, row),
-            {name: moved_model(model, fit.translation_m) for name, model in models.items()},
+            {name: moved_model(model, fit.translation_m) for name, model in adjusted.items()},
             typology=contents.typology.tolist(),
             progress=part_of(progress, 0.7, 0.3),
         )
@@ -148,8 +155,13 @@ def _models(block: Path, document: BlockDocument) -> dict[str, RpcModel]:
     return models
 
 
-def _scene(path: Path, models: dict[str, RpcModel], stack: ExitStack) -> Scene:
-    scene = read_scene(path)
+def _scene(
+    path: Path,
+    delivered: tuple[Path | None, CropOrigin | None],
+    models: dict[str, RpcModel],
+    stack: ExitStack,
+) -> Scene:
+    scene = read_scene(path, delivered[0], crop_origin=delivered[1])
     stack.callback(scene.image.close)  # type: ignore[attr-defined]
     name = scene.acquisition.image_id
     if name not in models:

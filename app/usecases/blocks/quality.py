@@ -309,4 +309,4 @@ def _read_adjusted(block: BlockToAssess, path: Path) -> Scene:
         raise InputError(
             f"{path}: {path.stem[:100]} is no image of the block; expected one of {names[:300]}"
         )
-    return read_scene(path, block.models[path.stem], sigma_m=1.0)
+    return read_scene(path, block.models[path.stem], sigma_m=1.0, crop_origin=(0.0, 0.0))

@@ -8,6 +8,7 @@ import numpy as np
 from amers.app.usecases.registration.check_points import ground_positions, marks_of_scene
 from amers.services.errors import InputError
 from amers.services.formats.sensor_models.refined_model import write_refined
+from amers.services.formats.sensor_models.rpc_files import ImageFiles
 from amers.services.imagery.scene import Scene
 from amers.services.misfit.affine_fit import FREE, Order
 from amers.services.misfit.control_observations import ControlObservations
@@ -114,8 +115,7 @@ def written(
         FormatError: a delivered file would be overwritten.
     """
     refined = write_refined(
-        image,
-        model,
+        ImageFiles(image, model),
         refinement.model,
         refinement.adjustment,
         shape=scene.image.shape,

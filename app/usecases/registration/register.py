@@ -25,8 +25,9 @@ from amers.app.usecases.registration.reference_source import (
 from amers.services.conventions import MAX_ERROR_SIGMAS
 from amers.services.errors import CoverageError
 from amers.services.formats.images.bands import parse_bands
-from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.images.scenes import read_scene, scene_name
 from amers.services.formats.sensor_models.refined_model import AdjustedRigorous, write_refined
+from amers.services.formats.sensor_models.rpc_files import ImageFiles
 from amers.services.geodesy import metres_per_degree
 from amers.services.imagery.scene import Scene, scene_footprint
 from amers.services.joint.results import RigorousScene
@@ -56,6 +57,8 @@ class SceneFiles:
         check_heights: vertical datum of their heights, where their format cannot state it.
         rigorous: name of the free parameters of its rigorous model, where it has one and is registered
             together with others; None uses its RPC. See `PARAMETER_SETS`.
+        crop_origin: line and sample of the image's first pixel in the image that the model is for; None
+            where its files state it.
     """
 
     image: Path
@@ -66,6 +69,7 @@ class SceneFiles:
     check_points: Path | None = None
     check_heights: str | None = None
     rigorous: str | None = None
+    crop_origin: tuple[float, float] | None = None
 
     def read(self) -> Scene:
         """The scene; its files stay open."""
@@ -74,6 +78,7 @@ class SceneFiles:
             self.model,
             sigma_m=self.sigma_m,
             bands=None if self.bands is None else parse_bands(self.bands),
+            crop_origin=self.crop_origin,
             mask=self.mask,
             parameter_set=None if self.rigorous is None else parameter_set_named(self.rigorous),
         )
@@ -217,8 +222,7 @@ def write_registered(
         )
     folder.mkdir(parents=True, exist_ok=True)
     refined = write_refined(
-        files.image,
-        files.model,
+        ImageFiles(files.image, files.model, files.crop_origin),
         model,
         registration.adjustment,
         shape=scene.image.shape,
@@ -228,7 +232,7 @@ def write_registered(
     )
     report = build_report(
         registration,
-        scene_record(scene, files.image.stem),
+        scene_record(scene, scene_name(files.image)),
         attempt.run_record(),
         RefinedModelRecord(refined.max_error_px, refined.note),
         figure_data(scene, control.points, control.chips, registration),

@@ -120,6 +120,10 @@ class RasterImage:
         """The image with other statements of its product about its pixels."""
         return replace(self, codes=codes)
 
+    def with_mix(self, mix: BandMix) -> "RasterImage":
+        """The same file with other bands."""
+        return replace(self, mix=mix)
+
     def __reduce__(self) -> tuple[Any, ...]:
         """In another process the file is opened again."""
         path = self.path if isinstance(self.path, Address) else self.path.resolve()

@@ -71,6 +71,14 @@ class TiledImage:
         for tile in self.tiles:
             tile.close()
 
+    def saturated_values(self, band: int) -> tuple[int, ...]:
+        """The values of a band that mean "saturated"."""
+        return self.tiles[0].saturated_values(band)
+
+    def with_mix(self, mix: BandMix) -> "TiledImage":
+        """The same files with other bands."""
+        return replace(self, tiles=tuple(tile.with_mix(mix) for tile in self.tiles))
+
     def with_codes(self, codes: PixelCodes) -> "TiledImage":
         """The image with other statements of its product about its pixels."""
         return replace(self, tiles=tuple(replace(tile, codes=codes) for tile in self.tiles))

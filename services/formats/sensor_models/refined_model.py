@@ -10,6 +10,7 @@ from amers.services.formats.sensor_models.correction_json import format_correcti
 from amers.services.formats.sensor_models.product_image import open_image
 from amers.services.formats.sensor_models.rpc_files import (
     DeliveredModel,
+    ImageFiles,
     has_rpc,
     model_of_image,
     read_rpc,
@@ -67,8 +68,7 @@ class RefinedFiles:
 
 
 def write_refined(
-    image_path: Path,
-    model_path: Path | None,
+    source: ImageFiles,
     model: SensorModel | AdjustedRigorous,
     adjustment: SceneAdjustment,
     *,
@@ -93,7 +93,7 @@ def write_refined(
     then applies to the delivered model.
 
     Args:
-        image_path, model_path: the files of the scene.
+        source: the files that the scene was read from.
         model: the delivered model with its correction, or an adjusted rigorous model.
         adjustment: order and covariance of the correction; for a rigorous model of the nearest one.
         shape: lines and samples of the image.
@@ -105,10 +105,11 @@ def write_refined(
         FormatError: a delivered file would be overwritten.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    image_path = source.image
     copied = image_path if copy_image and _is_geotiff(image_path) else None
     if copied is not None and (folder / copied.name).resolve() != copied.resolve():
         (folder / copied.name).unlink(missing_ok=True)
-    model_files, applies_to = _write_model(image_path, model_path, model, shape, folder, copied=copied)
+    model_files, applies_to = _write_model(source, model, shape, folder, copied=copied)
     text = format_correction(
         adjustment.correction,
         adjustment.order,
@@ -128,8 +129,7 @@ def write_refined(
 
 
 def _write_model(
-    image_path: Path,
-    model_path: Path | None,
+    source: ImageFiles,
     model: SensorModel | AdjustedRigorous,
     shape: tuple[int, int],
     folder: Path,
@@ -137,9 +137,10 @@ def _write_model(
     copied: Path | None,
 ) -> tuple[RefinedFiles, str]:
     """The files of a refined model, and what a correction beside them applies to."""
+    image_path = source.image
     base = model.base if isinstance(model, CorrectedModel) else None
     if isinstance(model, AdjustedRigorous):
-        delivered = _delivered_rpc(image_path, model_path)
+        delivered = _delivered_rpc(*source)
         model_files = _write_fitted(delivered, model, shape, folder, copied)
         applies_to = (
             f"rigorous model of {image_path.name}: the nearest correction to the adjusted one, "
@@ -150,7 +151,7 @@ def _write_model(
         model_files = _write_grid(image_path, grid, folder, copied is not None)
         applies_to = f"map grid of {image_path.name}"
     else:
-        delivered = read_rpc(image_path, model_path) if isinstance(base, RpcModel) else None
+        delivered = read_rpc(*source) if isinstance(base, RpcModel) else None
         model_files = _write_rpc(delivered, model, shape, folder, copied)
         applies_to = delivered.note if delivered else f"model of {image_path.name}"
     return model_files, applies_to
@@ -211,13 +212,15 @@ def _write_fitted(
     return RefinedFiles(tuple(files), off_px, note)
 
 
-def _delivered_rpc(image_path: Path, model_path: Path | None) -> DeliveredModel | None:
+def _delivered_rpc(
+    image_path: Path, model_path: Path | None, crop_origin: tuple[float, float] | None
+) -> DeliveredModel | None:
     """The RPC that was delivered beside a rigorous model; None without one."""
     image = open_image(image_path)
     try:
         if model_path is None and not has_rpc(image):
             return None
-        return model_of_image(image, model_path, None)
+        return model_of_image(image, model_path, crop_origin)
     finally:
         image.close()
 

@@ -4,6 +4,7 @@ import re
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -70,6 +71,21 @@ class DeliveredModel:
     def convention(self) -> Convention:
         """Format of the model in that file."""
         return self.found.convention
+
+
+class ImageFiles(NamedTuple):
+    """What the model of an image is read from.
+
+    Attributes:
+        image: the image, or as for `open_image`.
+        model: file of its model; None finds it.
+        crop_origin: line and sample of its first pixel in the image that the model is for; None where
+            its files state it.
+    """
+
+    image: Path
+    model: Path | None = None
+    crop_origin: tuple[float, float] | None = None
 
 
 def read_rpc(

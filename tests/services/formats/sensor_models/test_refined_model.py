@@ -21,6 +21,7 @@ from amers.services.formats.sensor_models.correction_json import (
     parse_correction_accuracy,
 )
 from amers.services.formats.sensor_models.refined_model import write_refined
+from amers.services.formats.sensor_models.rpc_files import ImageFiles
 from amers.services.formats.vector.residual_layers import exaggeration_for, write_residual_layers
 from amers.services.geodesy import metres_per_degree_at
 from amers.services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
@@ -235,7 +236,7 @@ def test_the_refined_model_of_an_ortho_scene_is_its_map_grid(registered, tmp_pat
     model = CorrectedModel(scene.model, correction)
     adjustment = replace(registered().adjustment, correction=correction, order="affine")
     left = write_refined(
-        path, None, model, adjustment, shape=shape, folder=tmp_path / "out", copy_image=True
+        ImageFiles(path), model, adjustment, shape=shape, folder=tmp_path / "out", copy_image=True
     )
     assert [file.name for file in left.files] == ["correction.json", "map.tif.aux.xml", "map.tif"]
     assert left.max_error_px == 0.0

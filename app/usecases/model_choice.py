@@ -1,0 +1,79 @@
+"""Which model each of several images has, as the options of a command or the inputs of a job name it."""
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from amers.app.errors import InputError
+from amers.services.formats.text_files import NUMBER_PATTERN
+
+CropOrigin = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class ModelChoice:
+    """The models of images, where they are not those that their names and tags give.
+
+    Attributes:
+        model: file of the model; for one of several images IMAGE=FILE, repeat. By default the first of
+            STEM.RPB, STEM.XML (WorldView), STEM_RPC.TXT, RPC_NAME.XML (DIMAP), STEM.rpc, tags of the
+            image, IMAGE.aux.xml, STEM_RPC.XML, STEM.geom, DIM_NAME.XML, METADATA.DIM, as in GDAL; for
+            JPEG 2000 IMAGE.aux.xml first, for NITF IMAGE.aux.xml, STEM_RPC.TXT and RPC00B first.
+        crop_origin: LINE,SAMPLE of the image's first pixel in the image that the model is for; 0,0 where
+            they are the same; for one of several images IMAGE=LINE,SAMPLE, repeat. By default as stated
+            by ICHIPB, .TIL, DIMAP or the geotransform.
+    """
+
+    model: tuple[str, ...] = ()
+    crop_origin: tuple[str, ...] = ()
+
+    def of(self, images: Sequence[Path]) -> dict[Path, tuple[Path | None, CropOrigin | None]]:
+        """The model file and the crop origin of each image; None where they are not given.
+
+        Raises:
+            InputError: a file does not exist, a value has another form, or it is of no image.
+        """
+        files = _by_image("--model", self.model, images)
+        origins = _by_image("--crop-origin", self.crop_origin, images)
+        for text in files.values():
+            if not Path(text).is_file():
+                raise InputError(f"--model: {text}: no such file; the file of a model expected")
+        return {
+            image: (
+                Path(files[image]) if image in files else None,
+                parse_crop_origin(origins[image]) if image in origins else None,
+            )
+            for image in images
+        }
+
+
+def parse_crop_origin(text: str, source: str = "--crop-origin") -> CropOrigin:
+    """Line and sample of a text.
+
+    Raises:
+        InputError: it has another form.
+    """
+    found = re.fullmatch(rf"\s*({NUMBER_PATTERN})\s*,\s*({NUMBER_PATTERN})\s*", text)
+    if found is None:
+        raise InputError(f"{source}: {text[:60]!r} found, LINE,SAMPLE expected, such as 8192,0")
+    return float(found[1]), float(found[2])
+
+
+def _by_image(option: str, values: Iterable[str], images: Sequence[Path]) -> dict[Path, str]:
+    """The values of an option by their images: FILE of the only image, IMAGE=FILE of one of several."""
+    found: dict[Path, str] = {}
+    for value in values:
+        name, sign, text = value.partition("=")
+        named = [image for image in images if sign and name in (str(image), image.name, image.stem)]
+        if not named and len(images) == 1:
+            named, text = list(images), value
+        if len(named) != 1:
+            raise InputError(
+                f"{option}: {value[:200]!r} belongs to {len(named)} of {len(images)} images: name the "
+                f"image by its path or its file, such as {option} {images[0].name}=…"
+            )
+        if named[0] in found:
+            raise InputError(f"{option}: given twice for {named[0].name}, once expected")
+        found[named[0]] = text
+    return found
