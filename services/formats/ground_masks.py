@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 
 from amers.services.errors import FormatError
-from amers.services.formats.images.raster import RasterImage, map_grid_of, open_raster
+from amers.services.formats.images.raster import RasterImage, map_grid_of, open_values
 from amers.services.formats.stac.catalogue import parse_area
 from amers.services.formats.text_files import load_json, read_text
 from amers.services.imagery.source import Window
@@ -97,7 +97,7 @@ def any_of(masks: list[GroundMask]) -> GroundMask | None:
 
 
 def _on_map(path: Path) -> tuple[RasterImage, MapGrid]:
-    image = open_raster(path)
+    image = open_values(path)
     grid = map_grid_of(image)
     if grid is None:
         image.close()

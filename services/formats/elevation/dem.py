@@ -9,7 +9,7 @@ from pyproj import CRS
 
 from amers.services.errors import CoverageError, FormatError, VerticalDatumError
 from amers.services.formats.elevation.heights import HeightsByCaller, height_datum
-from amers.services.formats.images.raster import RasterImage, map_grid_of, open_raster, shift_of_grid
+from amers.services.formats.images.raster import RasterImage, map_grid_of, open_values, shift_of_grid
 from amers.services.imagery.source import ImageSource, Window
 from amers.services.terrain import Geoid, Terrain
 from amers.services.types import FloatImage
@@ -38,7 +38,7 @@ def read_dem(
             other, or the grid of the geoid is missing.
         CoverageError: the grid of the geoid does not cover the terrain.
     """
-    image = open_raster(path)
+    image = open_values(path)
     try:
         grid = map_grid_of(image)
         if grid is None:

@@ -5,9 +5,12 @@ import re
 from dataclasses import dataclass
 
 from amers.services.errors import FormatError
+from amers.services.formats.addresses import FilePlace
 
 _ITEM = re.compile(r"\s*(\d{1,4})\s*(?::\s*(\d+(?:\.\d*)?|\.\d+)\s*)?")
 VISIBLE = ("red", "green", "blue")
+_BRIGHTNESS = ("Y", "lightness")
+_NO_BRIGHTNESS = ("cyan", "magenta", "yellow", "black", "hue", "saturation")
 
 
 @dataclass(frozen=True)
@@ -61,18 +64,34 @@ def parse_bands(text: str) -> BandMix:
     return BandMix(bands, tuple(weight / total for _, weight in weighted), "as requested")
 
 
-def default_mix(colours: tuple[str, ...]) -> BandMix:
+def default_mix(colours: tuple[str, ...], path: FilePlace | str = "image") -> BandMix:
     """The first band of an image with one or two bands, else the mean of its visible bands.
 
     Chips are panchromatic, and a panchromatic band covers the visible spectrum and little more. Where
-    the file does not name its red, green and blue bands, the first three are taken as visible.
+    the file does not name its red, green and blue bands, the first three are taken as visible. A band of
+    brightness alone (Y, lightness) is one; alpha bands do not count.
 
     Args:
         colours: colour interpretation of each band, by GDAL's names.
+        path: of the image, for messages.
+
+    Raises:
+        FormatError: the bands are inks, which are dark where the ground is bright.
     """
-    if len(colours) < 3:
-        return one_band(1, "the first band")
-    visible = tuple(colours.index(colour) + 1 for colour in VISIBLE if colour in colours)
-    if len(visible) == 3:
+    bands = {band: colour for band, colour in enumerate(colours, start=1) if colour != "alpha"}
+    visible = tuple(band for name in VISIBLE for band, colour in bands.items() if colour == name)
+    if len(bands) >= 3 and len(visible) == 3:
         return BandMix(visible, (1 / 3,) * 3, "mean of the red, green and blue bands")
-    return BandMix((1, 2, 3), (1 / 3,) * 3, "mean of the first three bands, taken as visible")
+    bright = [band for band, colour in bands.items() if colour in _BRIGHTNESS]
+    if bright:
+        return one_band(bright[0], "the band of brightness")
+    inks = [band for band, colour in bands.items() if colour in _NO_BRIGHTNESS]
+    if inks:
+        raise FormatError(
+            f"{path}: band {inks[0]} is {bands[inks[0]]}, an image in grey or in red, green and blue "
+            "expected; convert it, or name the band to use (--bands)"
+        )
+    first = tuple(bands)[:3] or (1,)
+    if len(bands) < 3:
+        return one_band(first[0], "the first band")
+    return BandMix(first, (1 / 3,) * 3, "mean of the first three bands, taken as visible")

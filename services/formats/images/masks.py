@@ -1,17 +1,64 @@
 """Masks: files that exclude pixels of an image."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from amers.services.errors import FormatError
-from amers.services.formats.images.raster import OpenImage, RasterImage, open_raster
+from amers.services.formats.images.raster import OpenImage, RasterImage, map_grid_of, open_values
 from amers.services.imagery.source import Window
-from amers.services.types import FloatImage
+from amers.services.map_grid import MapGrid
+from amers.services.statements import Statement, Statements, Subject, Use
+from amers.services.types import Array, FloatImage
 
 _SAME_SHAPE = 0.01
 """Largest relative difference between the pixel size ratios of mask and image along both axes."""
+_NODE_PX = 64
+"""Pixels of the image between those whose place in a mask on a map is computed."""
+_BORDER_NODES = 33
+"""Places along each side of the image at which a mask on a map has to reach it."""
+_BEYOND_PX = 1.0
+"""Pixels of a mask by which it may end inside the image: the next one is taken there."""
+
+
+@dataclass(frozen=True)
+class MaskGrids:
+    """The map grids of an image and of its mask.
+
+    Attributes:
+        image: of the image.
+        mask: of the mask.
+    """
+
+    image: MapGrid
+    mask: MapGrid
+
+    def position(self, line_sample: Array) -> Array:
+        """Positions (n, 2) in the mask of positions in the image (n, 2)."""
+        return self.mask.line_sample(self.image.lon_lat(line_sample))
+
+    def pixels(self, window: Window) -> tuple[Array, Array]:
+        """Rows and columns (lines, samples) of the mask under the pixels of a window of the image.
+
+        Positions are bilinear between nodes, whose maps are smooth.
+        """
+        axes = [_nodes(window.line, window.lines), _nodes(window.sample, window.samples)]
+        nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        seen = self.position(nodes.reshape(-1, 2)).reshape(nodes.shape)
+        weight = [
+            _weights(first + np.arange(count, dtype=np.float64), nodes_along)
+            for first, count, nodes_along in (
+                (window.line, window.lines, axes[0]),
+                (window.sample, window.samples, axes[1]),
+            )
+        ]
+        row, column = (
+            np.clip(np.rint(weight[0] @ seen[..., k] @ weight[1].T), 0, self.mask.shape[k] - 1)
+            for k in range(2)
+        )
+        return row.astype(np.int64), column.astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -21,15 +68,25 @@ class MaskedImage:
     Attributes:
         image: the image.
         mask: nonzero where pixels are excluded; covers the same ground, with the same or other pixels.
+        grids: where both lie on a map; None where the mask has the frame of the image.
     """
 
     image: OpenImage
     mask: RasterImage
+    grids: MaskGrids | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
         """Lines and samples."""
         return self.image.shape
+
+    @cached_property
+    def statements(self) -> Statements:
+        """Of the image, and of the mask about valid pixels."""
+        note = "laid over the whole image" if self.grids is None else "laid by its map grid"
+        name = self.mask.path.name
+        said = Statement(name, Subject.VALIDITY, Use.USED, "mask: no data where it is not 0", "", note)
+        return (*self.image.statements, said)
 
     def close(self) -> None:
         """Close both files."""
@@ -39,20 +96,27 @@ class MaskedImage:
     def read(self, window: Window) -> FloatImage:
         """Pixels of a window; NaN beyond the image, where nodata, and under the mask."""
         pixels = self.image.read(window)
-        line = _mask_pixels(window.line, window.lines, self.shape[0], self.mask.shape[0])
-        sample = _mask_pixels(window.sample, window.samples, self.shape[1], self.mask.shape[1])
-        first = int(line[0]), int(sample[0])
+        if self.grids is None:
+            line = _mask_pixels(window.line, window.lines, self.shape[0], self.mask.shape[0])
+            sample = _mask_pixels(window.sample, window.samples, self.shape[1], self.mask.shape[1])
+            row, column = np.broadcast_arrays(line[:, None], sample[None, :])
+        else:
+            row, column = self.grids.pixels(window)
+        first = int(row.min()), int(column.min())
         covered = self.mask.read(
-            Window(*first, int(line[-1]) - first[0] + 1, int(sample[-1]) - first[1] + 1)
+            Window(*first, int(row.max()) - first[0] + 1, int(column.max()) - first[1] + 1)
         )
         # Nodata in a mask excludes nothing.
         excluded = np.nan_to_num(covered) != 0.0
-        pixels[excluded[np.ix_(line - first[0], sample - first[1])]] = np.nan
+        pixels[excluded[row - first[0], column - first[1]]] = np.nan
         return pixels
 
 
 def apply_mask(image: OpenImage, mask: Path) -> MaskedImage:
     """The image without the pixels that a mask file excludes.
+
+    A mask on a map lies where its map grid says, and has to cover an image on a map. Any other has the
+    frame of the image.
 
     Args:
         image: opened image.
@@ -60,17 +124,59 @@ def apply_mask(image: OpenImage, mask: Path) -> MaskedImage:
             pixels; nonzero where pixels are excluded.
 
     Raises:
-        FormatError: the mask cannot be read, or its shape differs from that of the image.
+        FormatError: the mask cannot be read, does not cover the image, is on a map while the image is
+            not, or has other proportions.
     """
-    opened = open_raster(mask)
-    by_line, by_sample = (n / m for n, m in zip(image.shape, opened.shape, strict=True))
-    if abs(by_line / by_sample - 1.0) > _SAME_SHAPE:
+    opened = open_values(mask)
+    try:
+        on_map, of_image = map_grid_of(opened), map_grid_of(image)
+        if on_map is not None:
+            if of_image is None:
+                raise FormatError(
+                    f"{mask}: has a map grid, and {image.path.name} has none: give a mask in the pixels "
+                    "of the image, without a coordinate reference system"
+                )
+            grids = MaskGrids(of_image, on_map)
+            _check_cover(grids, mask, image)
+            return MaskedImage(image, opened, grids)
+        by_line, by_sample = (n / m for n, m in zip(image.shape, opened.shape, strict=True))
+        if abs(by_line / by_sample - 1.0) > _SAME_SHAPE:
+            raise FormatError(
+                f"{mask}: {opened.shape[0]} x {opened.shape[1]} pixels found, a mask of the same ground "
+                f"as {image.path.name} with the proportions of {image.shape[0]} x {image.shape[1]} "
+                "expected"
+            )
+    except FormatError:
         opened.close()
-        raise FormatError(
-            f"{mask}: {opened.shape[0]} x {opened.shape[1]} pixels found, a mask of the same ground as "
-            f"{image.path.name} with the proportions of {image.shape[0]} x {image.shape[1]} expected"
-        )
+        raise
     return MaskedImage(image, opened)
+
+
+def _check_cover(grids: MaskGrids, mask: Path, image: OpenImage) -> None:
+    """Refuse a mask on a map that does not reach the whole image."""
+    axes = [np.linspace(-0.5, size - 0.5, _BORDER_NODES) for size in image.shape]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    position = grids.position(places)
+    last = np.array(grids.mask.shape) - 0.5 + _BEYOND_PX
+    inside = ((position >= -0.5 - _BEYOND_PX) & (position <= last)).all(axis=1)
+    if not inside.all():
+        raise FormatError(
+            f"{mask}: covers {100.0 * inside.mean():.0f} % of {image.path.name} by its map grid, a mask "
+            "of all its ground expected"
+        )
+
+
+def _nodes(first: int, count: int) -> Array:
+    """Positions along an axis from the first to the last pixel of a window, about `_NODE_PX` apart."""
+    return np.linspace(first, first + count - 1, max(2, -(-count // _NODE_PX) + 1))
+
+
+def _weights(position: Array, nodes: Array) -> Array:
+    """Weights (n, k) of nodes (k,) in bilinear values at positions (n,)."""
+    step = nodes[1] - nodes[0]
+    if step == 0.0:
+        return np.eye(1, len(nodes)).repeat(len(position), axis=0)
+    return np.asarray(np.maximum(0.0, 1.0 - np.abs(position[:, None] - nodes) / step))
 
 
 def _mask_pixels(first: int, count: int, size: int, mask_size: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Untrusted image files: few drivers, no sidecars, bounded sizes; at a path nothing but a local file."""
+"""Untrusted image files: few drivers, few files beside, bounded sizes; at a path only a local file."""
 
 import shutil
 import warnings
@@ -11,7 +11,6 @@ import numpy.typing as npt
 import rasterio
 import rasterio.rpc
 from pyproj.exceptions import ProjError
-from rasterio.enums import MaskFlags
 from rasterio.errors import NotGeoreferencedWarning
 from rasterio.windows import Window as RasterWindow
 
@@ -26,11 +25,12 @@ from amers.services.formats.images.datasets import (
     open_dataset,
 )
 from amers.services.formats.images.georeference import georeference
+from amers.services.formats.images.validity import Validity, validity_of, values_of_palette
 from amers.services.formats.images.working_copy import Pixels, open_pixels
 from amers.services.imagery.source import ImageSource, Window
 from amers.services.map_grid import MapGrid
 from amers.services.sensors.rpc import RpcModel
-from amers.services.statements import Statements
+from amers.services.statements import Statement, Statements, Subject, Use
 from amers.services.types import FloatImage
 
 # An image that is not rectified has a sensor model instead of a map grid.
@@ -42,6 +42,8 @@ MAX_PIXELS = 40_000_000_000
 """Largest number of pixels of an image: twice a strip of 40,000 samples and 500,000 lines."""
 MAX_EXPANSION = 5_000
 """Largest ratio of pixel bytes to file bytes: Deflate reaches 1,032 on a constant image."""
+_ALL_LOST = 1.0 - 1e-6
+"""Sum of the weights of bands without data at which a mix has none: rounding leaves it below 1."""
 
 
 class OpenImage(ImageSource, Protocol):
@@ -55,6 +57,11 @@ class OpenImage(ImageSource, Protocol):
     @property
     def dataset(self) -> rasterio.DatasetReader:
         """Of the file, or of the first of the files."""
+        ...
+
+    @property
+    def statements(self) -> Statements:
+        """Of the files, and what became of them."""
         ...
 
     def close(self) -> None:
@@ -71,6 +78,8 @@ class RasterImage:
         dataset: the dataset that `open_raster` opened, with the metadata of the image.
         pixels: the dataset from which pixels are read: the same one, or a working copy.
         mix: the bands and their weights.
+        validity: which pixels have no data.
+        palette: grey value of each index of a band with a colour table; None for others.
         codes: statements of the product about its pixels, in addition to those of the file.
         statements: of the file, and what became of them.
     """
@@ -79,6 +88,8 @@ class RasterImage:
     dataset: rasterio.DatasetReader
     pixels: Pixels
     mix: BandMix
+    validity: Validity
+    palette: FloatImage | None = None
     codes: PixelCodes = field(default_factory=PixelCodes)
     statements: Statements = ()
 
@@ -95,7 +106,8 @@ class RasterImage:
     def read(self, window: Window) -> FloatImage:
         """Pixels of a window, (lines, samples) float32; see `ImageSource`.
 
-        A pixel of a mix has no data where one band has none, else it is saturated where one band is.
+        A pixel of a mix has no data where none of its bands has, as in `dataset_mask` of GDAL: it is the
+        mean of those that have. It is saturated where one band is.
 
         Raises:
             FormatError: the file cannot be read there.
@@ -115,6 +127,7 @@ class RasterImage:
     def close(self) -> None:
         """Close the file; it cannot be read afterwards."""
         self.pixels.close()
+        self.validity.close()
 
     def with_codes(self, codes: PixelCodes) -> "RasterImage":
         """The image with other statements of its product about its pixels."""
@@ -130,31 +143,47 @@ class RasterImage:
         return _opened_again, (path, self.mix, self.codes)
 
     def _fill(self, out: FloatImage, window: RasterWindow) -> None:
-        if len(self.mix.bands) == 1:
-            self._fill_band(out, self.band, window)
-            return
-        out[:] = 0.0
-        one = np.empty_like(out)
-        for band, weight in zip(self.mix.bands, self.mix.weights, strict=True):
-            self._fill_band(one, band, window)
-            out += np.float32(weight) * one
-
-    def _fill_band(self, out: FloatImage, band: int, window: RasterWindow) -> None:
-        flags = self.dataset.mask_flag_enums[band - 1]
-        nodata = self.dataset.nodatavals[band - 1]
         with as_format_error(self.path, "readable pixels"), rasterio.Env(**GDAL_CACHE):
             dataset = self.pixels.dataset
-            pixels = dataset.read(band, window=window)
+            if len(self.mix.bands) == 1:
+                self._fill_band(out, dataset, self.band, window)
+            else:
+                self._fill_mix(out, dataset, window)
+            hidden = self.validity.hidden(dataset, window)
+        if hidden is not None:
+            out[hidden] = np.nan
+
+    def _fill_mix(self, out: FloatImage, dataset: rasterio.DatasetReader, window: RasterWindow) -> None:
+        out[:] = 0.0
+        one, lost = np.empty_like(out), np.zeros(out.shape, dtype=np.float32)
+        for band, weight in zip(self.mix.bands, self.mix.weights, strict=True):
+            self._fill_band(one, dataset, band, window)
+            missing = np.isnan(one)
+            if missing.any():
+                one[missing] = 0.0
+                lost[missing] += np.float32(weight)
+            out += np.float32(weight) * one
+        if lost.any():
+            lost[lost >= _ALL_LOST] = np.nan
+            out /= 1.0 - lost
+
+    def _fill_band(
+        self, out: FloatImage, dataset: rasterio.DatasetReader, band: int, window: RasterWindow
+    ) -> None:
+        pixels = dataset.read(band, window=window)
+        if self.palette is None:
             out[:] = pixels
-            for saturated in self.saturated_values(band):
-                if pixels.max() >= saturated:
-                    out[pixels == saturated] = np.inf
-            if MaskFlags.nodata in flags:
-                out[pixels == nodata] = np.nan
-            elif MaskFlags.all_valid not in flags:
-                out[dataset.read_masks(band, window=window) == 0] = np.nan
-            elif self.codes.nodata is not None:
-                out[pixels == self.codes.nodata] = np.nan
+        else:
+            index = np.minimum(pixels, len(self.palette) - 1)
+            out[:] = np.where(index == pixels, self.palette[index], np.nan)
+        for saturated in self.saturated_values(band):
+            if pixels.max() >= saturated:
+                out[pixels == saturated] = np.inf
+        missing = self.validity.missing(band, pixels)
+        if missing is not None:
+            out[missing] = np.nan
+        elif self.codes.nodata is not None and not self.validity.is_stated(band):
+            out[pixels == self.codes.nodata] = np.nan
 
     def saturated_values(self, band: int) -> tuple[int, ...]:
         """The values of a band that mean "saturated": the largest of its bits, and that of the product.
@@ -177,10 +206,12 @@ class RasterImage:
 def open_raster(path: FilePlace, bands: int | BandMix | None = 1) -> RasterImage:
     """Open one band, or a mix of several, of a GeoTIFF (or COG), JPEG 2000 or NITF file.
 
-    Only the file itself is opened: no sidecar, no path that is a URL, no archive, no file that refers to
-    others. A file at an `Address`, as operators and their catalogues give, is read by parts. The last
-    pixel is read, so that a truncated file is refused here and not during the processing. A file that
-    would be unpacked again for each window is unpacked once, into a working copy.
+    Only the file itself is opened, with its mask `NAME.msk` and what GDAL keeps of its bands in
+    `NAME.aux.xml`: no path that is a URL, no archive, no file that refers to others. A file at an
+    `Address`, as operators and their catalogues give, is read by parts. The last pixel is read: a
+    truncated file is refused here and not during the processing. A file that would be unpacked again for
+    each window is unpacked once, into a working copy. Indices of a colour table are replaced by the grey
+    of their colours.
 
     Args:
         path: of a regular file, or an address.
@@ -191,22 +222,65 @@ def open_raster(path: FilePlace, bands: int | BandMix | None = 1) -> RasterImage
     """
     with rasterio.Env(**GDAL_OPTIONS):
         dataset = open_dataset(path)
-        if bands is None:
-            bands = default_mix(tuple(colour.name for colour in dataset.colorinterp))
-        mix = bands if isinstance(bands, BandMix) else one_band(bands)
         try:
+            validity = validity_of(path, dataset)
+            if bands is None:
+                bands = default_mix(validity.colours, path)
+            mix = bands if isinstance(bands, BandMix) else one_band(bands)
             _check_declaration(path, dataset, mix)
-            image = RasterImage(path, dataset, open_pixels(path, dataset), mix)
+            palette, statements = _palette(path, dataset, mix, validity)
+            image = RasterImage(path, dataset, open_pixels(path, dataset), mix, validity, palette)
+            statements += (*validity.statements, *_other_pages(path, dataset))
             last = replace(image, pixels=Pixels(path, dataset, is_copied=False))
             last.read(Window(image.shape[0] - 1, image.shape[1] - 1, 1, 1))
         except FormatError:
             dataset.close()
             raise
-    return image
+    return replace(image, statements=statements)
+
+
+def open_values(path: Path) -> RasterImage:
+    """Open the first band of an image for its values, such as classes, not for its colours.
+
+    Raises:
+        FormatError: the file cannot be used.
+    """
+    return replace(open_raster(path), palette=None)
 
 
 def _opened_again(path: FilePlace, mix: BandMix, codes: PixelCodes) -> RasterImage:
     return replace(open_raster(path, mix), codes=codes)
+
+
+def _palette(
+    path: FilePlace, dataset: rasterio.DatasetReader, mix: BandMix, validity: Validity
+) -> tuple[FloatImage | None, Statements]:
+    """The grey values of a colour table; None where the bands have none."""
+    with_table = [band for band in mix.bands if validity.colours[band - 1] == "palette"]
+    if not with_table:
+        return None, ()
+    value, band = "colour table", with_table[0]
+    if len(mix.bands) > 1:
+        raise FormatError(
+            f"{path}: band {band} has a colour table, and its values have no mean with other bands; "
+            f"give it alone (--bands {band})"
+        )
+    note = "the grey of each pixel is the mean of the red, green and blue of its colour"
+    said = Statement(path.name, Subject.BANDS, Use.USED, value, f"band {band}", note)
+    return values_of_palette(dataset, band), (said,)
+
+
+def _other_pages(path: FilePlace, dataset: rasterio.DatasetReader) -> Statements:
+    """What is said of further images in a file."""
+    others = len(dataset.subdatasets) - 1
+    if others < 1:
+        return ()
+    note = (
+        "the first is read; write another one into a file of its own: gdal_translate "
+        f"{dataset.subdatasets[1].replace(str(dataset.name), path.name)} OTHER.tif"
+    )
+    value = f"{others + 1} images in one file"
+    return (Statement(path.name, Subject.IDENTITY, Use.NOT_USED, value, "images 2 and more", note),)
 
 
 def map_grid_of(image: OpenImage) -> MapGrid | None:

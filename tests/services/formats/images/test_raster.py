@@ -121,16 +121,18 @@ def test_a_file_is_read_whatever_its_name(tmp_path: Path, name: str) -> None:
     assert open_raster(tmp_path / name).shape == PIXELS.shape
 
 
-def test_sidecars_are_ignored(tmp_path: Path) -> None:
+def test_files_beside_say_which_pixels_are_valid_and_are_no_tags(tmp_path: Path) -> None:
     path = write(tmp_path / "a.tif")
     (tmp_path / "a.tif.aux.xml").write_text(
-        '<PAMDataset><PAMRasterBand band="1"><NoDataValue>0</NoDataValue></PAMRasterBand></PAMDataset>'
+        '<PAMDataset><PAMRasterBand band="1"><NoDataValue>7</NoDataValue></PAMRasterBand></PAMDataset>'
     )
     (tmp_path / "a_RPC.TXT").write_text(
         (Path(__file__).parents[3] / "golden/invented_RPC.TXT").read_text()
     )
     image = open_raster(path)
     assert image.dataset.nodata is None
+    read = image.read(Window(0, 0, *PIXELS.shape))
+    np.testing.assert_array_equal(np.isnan(read), PIXELS == 7)
     assert not image.dataset.tags(ns="RPC")
 
 
