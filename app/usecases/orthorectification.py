@@ -54,7 +54,7 @@ from amers.services.orthorectification.rectify import (
     orthorectify,
     unseen,
 )
-from amers.services.statements import Statements, gathered
+from amers.services.statements import Statements, Subject, gathered
 from amers.services.types import Progress, no_progress
 
 ORTHO_NAME = "ortho.tif"
@@ -226,11 +226,13 @@ def run_orthorectification(
         ComputationError: the mapping exceeds the tolerance.
     """
     _check_request(ortho_map, output, (source.image, terrain.dem))
-    scene = read_scene(source.image, source.model, sigma_m=1.0, crop_origin=source.crop_origin)
+    # Each band is rectified by itself: none has to lie on another one.
+    one, origin = one_band(1), source.crop_origin
+    scene = read_scene(source.image, source.model, sigma_m=1.0, bands=one, crop_origin=origin)
     raster = scene.image
     assert isinstance(raster, RasterImage | TiledImage)
     ground = read_terrain(terrain)
-    bands = [raster.with_mix(one_band(band)) for band in _data_bands(raster)]
+    bands = [raster.with_mix(one_band(band)) for band in raster.validity.image_bands]
     grid = choose_grid(scene, ground, ortho_map.crs, ortho_map.gsd_m)
     dtype, nodata = _pixel_type(raster)
     if limits is not None:
@@ -253,7 +255,9 @@ def run_orthorectification(
         seen=counter.pixels / (lines * samples * len(bands)),
         error_px=error_px,
         vertical=ground.vertical,
-        statements=gathered(scene.statements + ground.statements),
+        statements=gathered(
+            one for one in scene.statements + ground.statements if one.subject is not Subject.BANDS
+        ),
     )
 
 
@@ -270,7 +274,7 @@ def _pixel_type(raster: SceneImage) -> tuple[str, float]:
     dtype = raster.dataset.dtypes[0]
     if dtype not in _KEPT_TYPES:
         dtype = "float32"
-    nodata = raster.dataset.nodata
+    nodata = raster.validity.nodata[0]
     if nodata is None:
         nodata = float("nan") if dtype == "float32" else 0.0
     return dtype, float(nodata)
@@ -289,12 +293,6 @@ class _DataPixels:
             yield window
         if self.pixels == 0:
             raise self.of_none()
-
-
-def _data_bands(image: SceneImage) -> list[int]:
-    """The numbers of the bands that are not an alpha band."""
-    colours = [colour.name for colour in image.dataset.colorinterp]
-    return [band for band, colour in enumerate(colours, start=1) if colour != "alpha"]
 
 
 def _check(connection: Connection, caller: Token, inputs: OrthorectifyScene) -> None:

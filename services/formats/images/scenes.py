@@ -10,9 +10,10 @@ import numpy as np
 
 from amers.services.errors import FormatError
 from amers.services.formats.addresses import FilePlace
-from amers.services.formats.images.bands import BandMix, PixelCodes
+from amers.services.formats.images.band_registration import with_registered_bands
+from amers.services.formats.images.bands import BandMix
 from amers.services.formats.images.georeference import georeference
-from amers.services.formats.images.masks import apply_mask
+from amers.services.formats.images.masks import MaskedImage, apply_mask
 from amers.services.formats.images.raster import map_grid_of, shift_of_grid
 from amers.services.formats.images.siblings import Siblings
 from amers.services.formats.images.tiled_image import SceneImage, TiledImage
@@ -29,7 +30,6 @@ from amers.services.formats.sensor_models.rpc_text import rpb_satellite
 from amers.services.formats.sensor_models.worldview_isd import parse_isd_acquisition
 from amers.services.formats.text_files import parse_xml, read_text
 from amers.services.imagery.scene import Scene, view_direction
-from amers.services.imagery.source import ImageSource
 from amers.services.map_grid import MapGrid
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.sensors.parameter_sets import ParameterSet
@@ -113,6 +113,7 @@ def read_scene(
     image = open_image(path, bands)
     siblings = Siblings(image.path)
     try:
+        image = _with_bands(image, is_requested=bands is not None)
         rigorous = None
         if parameter_set is not None:
             rigorous = rigorous_model_of_image(image, model_path, crop_origin)
@@ -124,13 +125,14 @@ def read_scene(
         file = rigorous.path if rigorous is not None and alone else model_path
         delivered = model_of_image(image, file, crop_origin, siblings)
         acquisition = _acquisition(image, delivered)
-        source = _masked(image.with_codes(_pixel_codes(delivered)), mask)
+        image = _with_codes(image, delivered)
+        source = _masked(image, mask)
     except FormatError:
         image.close()
         raise
     if sigma_m is None:
         sigma_m = prior_sigma_m(delivered.model, acquisition.sensor)
-    statements = (*image.statements, *delivered.statements, *_unused_grid(image, delivered))
+    statements = (*source.statements, *delivered.statements, *_unused_grid(image, delivered))
     if rigorous is None:
         return Scene(source, delivered.model, acquisition, sigma_m, statements=statements)
     model = rigorous.model
@@ -170,12 +172,13 @@ def _ortho_scene(image: SceneImage, grid: MapGrid, sigma_m: float | None, mask: 
         sigma_m = _ortho_sigma_m(image.path, acquisition.sensor)
     shift = shift_of_grid(image, grid)
     stated = georeference(image.path, image.dataset).statements
+    source = _masked(image, mask)
     return Scene(
-        _masked(image, mask),
+        source,
         OrthoModel(grid),
         acquisition,
         math.hypot(sigma_m, shift.sigma_m),
-        statements=(*image.statements, *stated, shift.statement(image.path.name)),
+        statements=(*source.statements, *stated, shift.statement(image.path.name)),
     )
 
 
@@ -231,16 +234,48 @@ def prior_sigma_m(model: RpcModel, sensor: str) -> float:
     return UNKNOWN_SIGMA_M
 
 
-def _masked(image: SceneImage, mask: Path | None) -> ImageSource:
+def _with_bands(image: SceneImage, *, is_requested: bool) -> SceneImage:
+    """The image with bands that lie on each other, and what is said of them."""
+    image, said = with_registered_bands(image, is_requested=is_requested)
+    stated = (*image.statements, *([] if said is None else [said]), *_units(image))
+    return replace(image, statements=stated)
+
+
+def _units(image: SceneImage) -> Statements:
+    """What is said of the unit of the pixels: only their contrast counts."""
+    band = image.mix.bands[0]
+    scale, offset = image.dataset.scales[band - 1], image.dataset.offsets[band - 1]
+    stated = [image.dataset.units[band - 1] or ""]
+    stated += [f"scale {scale:g}, offset {offset:g}"] if (scale, offset) != (1.0, 0.0) else []
+    value = ", ".join(part for part in stated if part)
+    if not value:
+        return ()
+    note = "grey values are used as they are stored: only their contrast counts"
+    return (Statement(image.path.name, Subject.UNIT, Use.NOT_USED, value, f"band {band}", note),)
+
+
+def _masked(image: SceneImage, mask: Path | None) -> SceneImage | MaskedImage:
     return image if mask is None else apply_mask(image, mask)
 
 
-def _pixel_codes(delivered: DeliveredModel) -> PixelCodes:
-    """The codes that the DIMAP document of the product states; none without such a document."""
+def _with_codes(image: SceneImage, delivered: DeliveredModel) -> SceneImage:
+    """The image with the codes that the DIMAP document of its product states, if there is one."""
     product = delivered.path.with_name(_product_name(delivered.path))
     if delivered.convention != "dimap" or not product.is_file():
-        return PixelCodes()
-    return parse_dimap_pixel_codes(read_text(product), product.name)
+        return image
+    codes = parse_dimap_pixel_codes(read_text(product), product.name)
+    image = image.with_codes(codes)
+    if codes.nodata is None:
+        return image
+    is_used = not image.validity.is_stated(image.mix.bands[0])
+    said = Statement(
+        product.name,
+        Subject.VALIDITY,
+        Use.USED if is_used else Use.NOT_USED,
+        f"no data where the value is {codes.nodata}",
+        note="" if is_used else f"{image.path.name} goes before it",
+    )
+    return replace(image, statements=(*image.statements, said))
 
 
 def _acquisition(image: SceneImage, delivered: DeliveredModel) -> Acquisition:

@@ -9,8 +9,9 @@ from amers.services.errors import FormatError
 from amers.services.formats.addresses import FilePlace
 from amers.services.formats.images.bands import BandMix, PixelCodes
 from amers.services.formats.images.raster import RasterImage, open_raster
+from amers.services.formats.images.validity import Validity
 from amers.services.imagery.source import Window
-from amers.services.statements import Statements
+from amers.services.statements import Statements, gathered
 from amers.services.types import FloatImage
 
 
@@ -41,6 +42,11 @@ class TiledImage:
     def mix(self) -> BandMix:
         """The bands, and their weights."""
         return self.tiles[0].mix
+
+    @property
+    def validity(self) -> Validity:
+        """Which pixels of the tiles have no data, as the first one states it."""
+        return self.tiles[0].validity
 
     @property
     def codes(self) -> PixelCodes:
@@ -124,4 +130,5 @@ def open_tiles(
         for image in images:
             image.close()
         raise
-    return TiledImage(path, shape, tuple(images), tuple(first for _, first, _ in tiles))
+    statements = gathered(one for image in images for one in image.statements)
+    return TiledImage(path, shape, tuple(images), tuple(first for _, first, _ in tiles), statements)
