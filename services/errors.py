@@ -4,6 +4,7 @@ AmersError
 ├── InputError              the input cannot be used; the user can correct it
 │   ├── FormatError         the content of a file or a document is missing or wrong
 │   ├── CoverageError       two data sets that must overlap do not
+│   ├── MissingStatements   several facts that neither files nor options state
 │   └── VerticalDatumError  heights whose datum is unknown or not supported
 │       └── MissingGeoid    the grid of their geoid is not installed, and no file of it is given
 └── ComputationError        the input is valid, but gives no trustworthy result
@@ -19,7 +20,7 @@ AmersError
 Every message states the values found and expected.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 
 class AmersError(Exception):
@@ -32,6 +33,39 @@ class InputError(AmersError):
 
 class FormatError(InputError):
     """The content of a file or a document is missing or wrong."""
+
+
+class MissingStatements(InputError):
+    """What neither the files nor the caller state, with the options that state it.
+
+    Attributes:
+        missing: a sentence for each.
+    """
+
+    def __init__(self, missing: Sequence[str]) -> None:
+        sentences = "; ".join(f"({count}) {text}" for count, text in enumerate(missing, start=1))
+        several = f"{len(missing)} statements are missing: {sentences}"
+        super().__init__(several if len(missing) > 1 else missing[0])
+        self.missing = tuple(missing)
+
+
+def refuse_unstated(missing: Sequence[InputError]) -> None:
+    """Raise the errors of missing statements as one, which names them all; nothing where there is none.
+
+    Args:
+        missing: in the order of the options that mend them.
+
+    Raises:
+        InputError: the only one.
+        MissingStatements: several.
+    """
+    if len(missing) == 1:
+        raise missing[0]
+    if missing:
+        parts = [
+            error.missing if isinstance(error, MissingStatements) else (str(error),) for error in missing
+        ]
+        raise MissingStatements([text for part in parts for text in part])
 
 
 class CoverageError(InputError):

@@ -1,8 +1,9 @@
 """All readers of files that others write, with what becomes of each statement in such a file."""
 
+from amers.services.formats.gcp.rows import POINT_READERS
 from amers.services.formats.reader_rows import Reader
 
-READERS: tuple[Reader, ...] = ()
+READERS: tuple[Reader, ...] = (*POINT_READERS,)
 """In the order of `docs/inputs.md`."""
 
 OWN_FILES = frozenset(
@@ -33,6 +34,7 @@ PARTS = frozenset(
         "parse_bands",
         "parse_columns",
         "parse_crs",
+        "parse_field",
         "parse_footprint",
         "parse_imaging_time",
         "parse_item",
@@ -41,12 +43,16 @@ PARTS = frozenset(
         "parse_numbers",
         "parse_polygons",
         "parse_xml",
+        "read_comments",
         "read_control_points",
         "read_ground_points",
+        "read_head",
         "read_marked_ground",
         "read_masks",
+        "read_or_missing",
         "read_rpc",
         "read_text",
+        "read_used_points",
         "open_base_chip",
         "read_base_chips",
     }

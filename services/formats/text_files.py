@@ -1,5 +1,6 @@
 """Contents of small text files: text, decimal numbers, JSON, XML."""
 
+import codecs
 import json
 import re
 from pathlib import Path
@@ -16,12 +17,31 @@ _MAX_TEXT_BYTES = 20_000_000
 
 
 def read_text(path: FilePlace) -> str:
-    """The content of a small text file in UTF-8, with or without a byte order mark, or else in Latin-1.
+    """The content of a small text file, with its ends of lines.
+
+    It is in UTF-8, with or without a byte order mark, in UTF-16 with one, or else in Latin-1.
 
     Raises:
-        FormatError: the file cannot be read, or is larger than 20 MB.
+        FormatError: the file cannot be read, is larger than 20 MB, or is in UTF-16 or binary without a
+            byte order mark.
     """
     data = path.read_bytes(_MAX_TEXT_BYTES) if isinstance(path, Address) else _content(path)
+    return _decoded(data, str(path))
+
+
+def _decoded(data: bytes, name: str) -> str:
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        try:
+            return data.decode("utf-16")
+        except UnicodeDecodeError:
+            raise FormatError(
+                f"{name}: UTF-16 expected by its byte order mark; the text is damaged"
+            ) from None
+    if b"\0" in data[:1000]:
+        raise FormatError(
+            f"{name}: expected a text, found bytes of 0: save it as UTF-8, or give the file that it "
+            "belongs to"
+        )
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:

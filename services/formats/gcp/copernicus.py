@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from amers.services.errors import FormatError
+from amers.services.formats.elevation.heights import unit_m
 from amers.services.formats.gcp.map_check import check_map_position
 from amers.services.formats.gcp.marked_points import (
     WGS84_3D,
@@ -20,8 +21,10 @@ from amers.services.formats.gcp.marked_points import (
     marked_points,
     to_wgs84,
 )
+from amers.services.formats.gcp.record import Record
 from amers.services.formats.gcp.text_lines import check_lon_lat, coordinate_array
 from amers.services.formats.text_files import load_json, parse_number
+from amers.services.statements import Subject
 
 COPERNICUS_KEY = "GCP_DB"
 """The only member of the document."""
@@ -56,7 +59,15 @@ def parse_copernicus(
                 f"{points[name]}; expected one position for each ID"
             )
     ground = to_wgs84(coordinate_array(list(points.values())), WGS84_3D.to_2d(), heights, source)
-    return marked_points(list(points), ground, np.full((len(points), 2), np.nan))
+    record = Record(source)
+    record.assumed(Subject.HORIZONTAL_DATUM, "WGS 84", "Longitude, Latitude")
+    record.used(Subject.ORDER, "X, Y in EPSG", "", "compared with longitude and latitude")
+    record.used(Subject.UNIT, "metres", "Altimetry")
+    if '"Quality_Indicators"' in text:
+        record.not_used(Subject.ACCURACY, "Quality_Indicators")
+    return marked_points(
+        list(points), ground, np.full((len(points), 2), np.nan), tuple(record.statements)
+    )
 
 
 def copernicus_chips(text: str, source: str = "Copernicus GCP database") -> list[tuple[str, int, str]]:
@@ -112,6 +123,9 @@ def _point(gcp: Any, where: str) -> tuple[str, tuple[float, float, float]]:
         for key in ("Longitude", "Latitude", "Altimetry", "X", "Y")
     )
     check_lon_lat(lon, lat, f"{where}, ID {name}")
+    altimetry = info.get("Altimetry")
+    unit = altimetry.get("@unit", "m") if isinstance(altimetry, dict) else "m"
+    height_m *= unit_m(str(unit), f"{where}, ID {name}", "Altimetry")
     epsg = _text(info.get("EPSG")).upper().removeprefix("EPSG:")
     if re.fullmatch(r"32[67](0[1-9]|[1-5]\d|60)", epsg) is None:
         raise FormatError(

@@ -1,26 +1,43 @@
 """Ground points in CSV files, whose columns have the names below or are mapped to them by the caller."""
 
-import csv
-import io
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pyproj import CRS
 
-from amers.services.errors import FormatError, InputError
+from amers.services.errors import (
+    FormatError,
+    InputError,
+    MissingStatements,
+    VerticalDatumError,
+    refuse_unstated,
+)
+from amers.services.formats.gcp.comments import (
+    Comments,
+    agreed_heights,
+    check_axes,
+    earth_crs,
+    read_comments,
+)
+from amers.services.formats.gcp.csv_columns import ABOVE_SEA, Head, chosen_height, read_head
+from amers.services.formats.gcp.csv_numbers import has_decimal_comma, parse_field
+from amers.services.formats.gcp.csv_table import CsvHead, CsvRow, csv_head, csv_rows
 from amers.services.formats.gcp.marked_points import (
+    ELLIPSOID,
     Ground,
     Heights,
     MarkedPoints,
+    horizontal_unit_m,
     marked_points,
-    parse_crs,
+    no_datum,
     to_wgs84,
 )
+from amers.services.formats.gcp.record import Record
 from amers.services.formats.gcp.text_lines import check_lon_lat, sequential_ids
-from amers.services.formats.text_files import parse_number
-from amers.services.types import Array
+from amers.services.statements import Subject
+from amers.services.types import Array, BoolArray
 
 COLUMNS = [
     "id",
@@ -43,11 +60,18 @@ COLUMNS = [
 PIXEL_ORIGINS = {"centre": 0.0, "corner": 0.5, "centre-1": 1.0, "corner-1": 1.5}
 """Line and sample of the centre of the first pixel, by the names of conventions: the centre is (0, 0),
 the corner is (0, 0), the centre is (1, 1), the corner is (1, 1)."""
-_ORIGIN, _CRS = "pixel-origin", "crs"
-"""What a line before the names may state: `# pixel-origin=corner crs=EPSG:32633`."""
-_STATEMENT = re.compile(r"#\s*(?:(?:pixel-origin|crs)=\S+\s*)+")
+_ORIGIN = re.compile(r"\bpixel-origin\s*[=:]\s*(\S+)", re.IGNORECASE)
+"""What a line before the names may state: `# pixel-origin=corner crs=EPSG:32633 heights=EGM96`."""
 _POSITIONS = ({"lon", "lat"}, {"x", "y"})
-_DELIMITERS = ",;\t"
+_POSITION_NAMES = ("lon", "lat", "x", "y")
+_WGS84 = CRS.from_epsg(4326)
+_STATEMENT = re.compile(
+    r"(units?|uom|heightunits?)|(vdatum|verticaldatum|heightdatum|vcrs|geoidmodel)|"
+    r"(?:h?datum|horizontaldatum|crs|srs|epsg|epsgcode|srid|projection|zone|utmzone|ellipsoid)"
+)
+"""Columns whose values state a unit, a vertical datum, or a reference system."""
+_FLAGS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
+_EARTH = {"wgs84", "wgs 84", "wgs_84", "wgs-84", "4326", "epsg:4326", "4979", "epsg:4979"}
 
 
 @dataclass(frozen=True)
@@ -82,9 +106,20 @@ def parse_columns(text: str) -> dict[str, str]:
 
 
 def is_csv(text: str, layout: CsvLayout) -> bool:
-    """Whether the first line of a text names columns of a position."""
-    names = _header(text)[1]
-    return any({layout.columns.get(n, n) for n in position} <= set(names) for position in _POSITIONS)
+    """Whether the first line of a text, after comments, names columns of a position."""
+    return _names_position(csv_head(text, lambda names: _names_position(names, layout)).names, layout)
+
+
+def _names_position(names: list[str], layout: CsvLayout) -> bool:
+    known = {_value_of(name, layout).name for name in names}
+    return any(position <= known for position in _POSITIONS)
+
+
+def lacks_pixel_origin(text: str, layout: CsvLayout) -> bool:
+    """Whether a text has columns of marks, but does not state the origin of its pixels."""
+    head = csv_head(text, lambda names: _names_position(names, layout))
+    stated = any(_ORIGIN.search(line) for _, line in head.comments)
+    return not stated and {"line", "sample"} <= {_value_of(name, layout).name for name in head.names}
 
 
 def parse_csv(
@@ -92,142 +127,288 @@ def parse_csv(
 ) -> MarkedPoints:
     """The points of a CSV file with a line of column names; an empty field is an unknown value.
 
-    A line before the names may state the origin of pixels and the reference system of x and y. Positions
-    in images are read where it states their origin.
+    Comments before the names may state the origin of pixels, the reference system and the datum of the
+    heights. Positions in images are read where they state their origin. A head may state the unit and
+    the datum of heights.
 
     Args:
         text: contents of the file; commas, semicolons or tabs separate fields.
         layout: what the caller states about the file.
-        heights: datum of the heights, which the file does not state.
+        heights: datum of the heights, where the file does not state it.
         source: its name, for messages.
 
     Raises:
-        FormatError: a column is missing, or a line has another form.
+        FormatError: a column is missing or not understood, or a line has another form.
         InputError: neither file nor caller state the reference system of x and y, or both do.
-        VerticalDatumError: the caller does not state the datum of the heights.
+        VerticalDatumError: neither the file nor the caller states the datum of the heights, or they
+            differ.
+        MissingStatements: several of these are missing.
     """
-    statements, names = _first_lines(text)
-    delimiter, header = _header(text)
-    places = _places(header, layout, source)
-    on_map = "x" in places
-    corner_px = _corner_px(places, statements.get(_ORIGIN), source)
-    crs = _crs(statements.get(_CRS), layout.crs, source, on_map=on_map)
-    lines = csv.reader(io.StringIO(text), delimiter=delimiter, strict=True)
-    rows: list[dict[str, str]] = []
-    wheres: list[str] = []
-    try:
-        for _ in range(names):
-            next(lines)
-        for fields in lines:
-            where = f"{source}, line {lines.line_num}"
-            if not any(field.strip() for field in fields):
-                continue
-            if len(fields) != len(header):
-                raise FormatError(
-                    f"{where}: expected {len(header)} fields, as many as columns, found {len(fields)}"
-                )
-            rows.append({name: fields[place].strip() for name, place in places.items()})
-            wheres.append(where)
-    except csv.Error as error:
-        raise FormatError(f"{source}, line {lines.line_num}: expected CSV: {error}") from None
-    numbers = {
-        name: np.array(
-            [_number(row[name], name, where) for row, where in zip(rows, wheres, strict=True)]
-        )
-        for name in places
-        if name not in ("id", "image")
-    }
+    head = csv_head(text, lambda names: _names_position(names, layout))
+    comments = read_comments(head.comments, source)
+    record = Record(source, list(comments.statements))
+    columns = _columns(head.names, layout, comments, heights, source)
+    rows = csv_rows(text, head, source)
+    numbers = _numbers(rows, columns)
+    datum = _datum(columns, numbers, comments, heights, record)
+    crs = _crs(columns, comments, layout, record)
+    states_datum = datum is not None or np.isnan(numbers.get("height_m", np.full(1, np.nan))).all()
+    missing: list[InputError] = [] if states_datum else [no_datum(source)]
+    refuse_unstated(missing if crs is not None else [*missing, _no_crs(source)])
+    assert crs is not None
+    sigmas = ", ".join(head.text for name, head in columns.heads.items() if name.startswith("sigma_"))
+    if sigmas:
+        record.used(Subject.ACCURACY, sigmas, "columns")
+    active, check = (_flags(rows, columns, name, record) for name in ("active", "check"))
+    _record_unused(rows, columns, datum, crs, record, is_stated=layout.crs is not None)
+    _check_units(columns, crs, record)
+    points = _ground(numbers, columns, crs, datum, rows)
+    corner_px = _corner_px(columns, head, record)
     return marked_points(
-        [_name(row["id"], where) for row, where in zip(rows, wheres, strict=True)]
-        if "id" in places
+        [_name(row.fields[columns.places["id"]], row.where) for row in rows]
+        if "id" in columns.places
         else sequential_ids([(0.0, 0.0)] * len(rows)),
-        _ground(numbers, crs, heights, wheres, source, on_map=on_map),
+        points,
         np.column_stack([_column(numbers, name, rows) for name in ("line", "sample")]) - corner_px,
+        statements=tuple(record.statements),
         sigma_m=_sigmas_m(numbers, rows, source),
-        image=[row.get("image", "") for row in rows],
+        image=[row.fields[columns.places["image"]] if "image" in columns.places else "" for row in rows],
         sigma_px=_column(numbers, "sigma_px", rows),
+        active=active,
+        check=check,
     )
 
 
-def _first_lines(text: str) -> tuple[dict[str, str], int]:
-    """What a line before the names of the columns states, and the number of the line of names."""
-    first = text.partition("\n")[0].rstrip("\r")
-    if _STATEMENT.fullmatch(first) is None:
-        return {}, 1
-    return dict(word.split("=", 1) for word in first.lstrip("#").split()), 2
+@dataclass(frozen=True)
+class _Columns:
+    """The columns of a file: heads and places of those that are read, and heads of the others."""
+
+    source: str
+    heads: dict[str, Head]
+    places: dict[str, int]
+    unused: list[tuple[int, Head]]
+
+    @property
+    def on_map(self) -> bool:
+        return "x" in self.places
 
 
-def _header(text: str) -> tuple[str, list[str]]:
-    """The delimiter of the line of names, and its fields."""
-    lines = text.split("\n", 2)
-    names = lines[_first_lines(text)[1] - 1].rstrip("\r") if len(lines) > 1 else text
-    delimiter = max(_DELIMITERS, key=names.count)
-    try:
-        return delimiter, [name.strip() for name in next(csv.reader([names], delimiter=delimiter), [])]
-    except csv.Error:
-        return delimiter, []
+def _value_of(text: str, layout: CsvLayout) -> Head:
+    """The head of a column; the caller, the documents, or its words name its value."""
+    head = read_head(text)
+    mapped = {column: name for name, column in layout.columns.items()}
+    if text in mapped:
+        return replace(head, name=mapped[text])
+    if text in COLUMNS and text != "height_m":
+        return replace(head, name=text if text not in layout.columns else None)
+    return head
 
 
-def _places(header: list[str], layout: CsvLayout, source: str) -> dict[str, int]:
-    """The place of each known column in a line."""
+def _columns(
+    header: list[str], layout: CsvLayout, comments: Comments, heights: Heights | None, source: str
+) -> _Columns:
+    """The columns of a file, by their heads."""
+    where = f"{source}, names of the columns"
+    for name, column in layout.columns.items():
+        if column not in header:
+            raise FormatError(
+                f"{where}: expected a column {column!r} for {name}, found {', '.join(header)[:200]}"
+            )
+    heads = [_value_of(text, layout) for text in header]
     places: dict[str, int] = {}
-    for name in COLUMNS:
-        column = layout.columns.get(name, name)
-        if header.count(column) > 1:
-            raise FormatError(
-                f"{source}, names of the columns: found {header.count(column)} columns {column!r}, "
-                "expected one"
-            )
-        if column in header:
-            places[name] = header.index(column)
-        elif name in layout.columns:
-            raise FormatError(
-                f"{source}, names of the columns: expected a column {column!r} for {name}, found "
-                f"{', '.join(header)[:200]}"
-            )
-    given = [position for position in _POSITIONS if position & set(places)]
-    if len(given) != 1 or not given[0] <= set(places):
+    for name in (*(name for name in COLUMNS if name != "height_m"), "active", "check"):
+        of_name = [place for place, head in enumerate(heads) if head.name == name]
+        exact = [place for place in of_name if header[place] in (name, layout.columns.get(name))]
+        if len(exact) > 1 or (name in ("lon", "lat", "x", "y") and not exact and len(of_name) > 1):
+            found = [header[place] for place in exact or of_name]
+            raise FormatError(f"{where}: found {len(found)} columns {found[0]!r}, expected one")
+        if of_name:
+            places[name] = (exact or of_name)[0]
+    height = _height_place(heads, header, layout, comments.heights or heights, source)
+    if height is not None:
+        places["height_m"] = height
+    given = [position for position in _POSITIONS if position <= set(places)]
+    is_projected = layout.crs is not None or (comments.crs is not None and comments.crs.is_projected)
+    if len(given) == 2:
+        given = given[1:] if is_projected else given[:1]
+    if len(given) != 1:
         raise FormatError(
-            f"{source}, names of the columns: expected the columns lon and lat, or x and y, found "
+            f"{where}: expected the columns lon and lat, or x and y, found "
             f"{', '.join(header)[:200]}; name them (--columns lon=COLUMN,lat=COLUMN)"
         )
-    return places
+    for name in {"lon", "lat", "x", "y"} - given[0]:
+        places.pop(name, None)
+    unused = [(place, head) for place, head in enumerate(heads) if place not in places.values()]
+    return _Columns(source, {name: heads[place] for name, place in places.items()}, places, unused)
 
 
-def _corner_px(places: dict[str, int], origin: str | None, source: str) -> float:
+def _height_place(
+    heads: list[Head], header: list[str], layout: CsvLayout, heights: Heights | None, source: str
+) -> int | None:
+    """The place of the column of heights: that of the caller, `height_m`, or the one by its words."""
+    mapped = layout.columns.get("height_m")
+    exact = [place for place, text in enumerate(header) if text == (mapped or "height_m")]
+    if len(exact) > 1:
+        raise FormatError(
+            f"{source}, names of the columns: found {len(exact)} columns {header[exact[0]]!r}, "
+            "expected one"
+        )
+    if exact:
+        return exact[0]
+    return chosen_height(heads, None if heights is None else str(heights).lower(), source)
+
+
+def _numbers(rows: list[CsvRow], columns: _Columns) -> dict[str, Array]:
+    """The numbers (n,) of each column in metres, degrees and pixels, NaN for empty fields."""
+    places = {
+        name: place
+        for name, place in columns.places.items()
+        if name not in ("id", "image", "active", "check")
+    }
+    comma = any(has_decimal_comma(row.fields[place]) for row in rows for place in places.values())
+    factor = {
+        name: 1.0 if name in _POSITION_NAMES else columns.heads[name].unit_m or 1.0 for name in places
+    }
+    return {
+        name: factor[name]
+        * np.array([parse_field(row.fields[place], name, row.where, comma=comma) for row in rows])
+        for name, place in places.items()
+    }
+
+
+def _datum(
+    columns: _Columns,
+    numbers: dict[str, Array],
+    comments: Comments,
+    heights: Heights | None,
+    record: Record,
+) -> Heights | None:
+    """The datum of the heights that file or caller state; None where neither does."""
+    head = columns.heads.get("height_m")
+    if head is None:
+        return ELLIPSOID
+    where = f"column {head.text}"
+    of_file = comments.heights
+    if head.datum not in (None, ABOVE_SEA):
+        of_file = str(agreed_heights(of_file, head.datum, f"{columns.source}, {where}"))
+        record.used(Subject.VERTICAL_DATUM, str(head.datum), where)
+    datum = agreed_heights(of_file, heights, f"{columns.source}, {where}")
+    if head.datum == ABOVE_SEA:
+        if datum == ELLIPSOID:
+            raise VerticalDatumError(
+                f"{columns.source}, {where}: heights above sea level by its name, ellipsoid given; "
+                "state their geoid (--vertical EGM96, or --geoid)"
+            )
+        record.used(Subject.VERTICAL_DATUM, ABOVE_SEA, where)
+    return datum
+
+
+def _no_crs(source: str) -> MissingStatements:
+    return MissingStatements(
+        [
+            f"{source}: expected one reference system of x and y, found none; state it (--crs), such as "
+            "EPSG:32633, or in a first line '# crs=EPSG:32633'"
+        ]
+    )
+
+
+def _crs(columns: _Columns, comments: Comments, layout: CsvLayout, record: Record) -> CRS | None:
+    """The reference system of the positions; None where none is stated of x and y."""
+    source = columns.source
+    of_caller = None if layout.crs is None else earth_crs(layout.crs, f"{source}: --crs")
+    if of_caller is not None and comments.crs is not None:
+        raise InputError(
+            f"{source}: expected one reference system of x and y, found {comments.crs.to_string()[:40]} "
+            f"and {layout.crs}; leave --crs out"
+        )
+    crs = of_caller or comments.crs
+    if columns.on_map:
+        return crs if crs is None else crs.to_2d()
+    if crs is None:
+        record.assumed(Subject.HORIZONTAL_DATUM, "WGS 84", "", "--crs states another")
+        return CRS.from_epsg(4326)
+    if not crs.is_geographic:
+        raise InputError(
+            f"{source}: {crs.to_string()[:40]} given as reference system of x and y, but the file "
+            "has lon and lat, degrees of WGS 84; leave --crs out, or name the columns x and y"
+        )
+    return crs.to_2d()
+
+
+def _flags(rows: list[CsvRow], columns: _Columns, name: str, record: Record) -> BoolArray:
+    """Which rows (n,) a column of yes and no names; of another column, none is left out."""
+    default = name == "active"
+    if name not in columns.places:
+        return np.full(len(rows), default)
+    fields = [row.fields[columns.places[name]].lower() for row in rows]
+    where = f"column {columns.heads[name].text}"
+    if not set(fields) <= set(_FLAGS):
+        record.not_used(Subject.VALIDITY, sorted(set(fields))[0][:40], where, "expected 1 or 0")
+        return np.full(len(rows), default)
+    flags = np.array([_FLAGS[field] for field in fields], dtype=np.bool_)
+    record.used(Subject.VALIDITY, f"{int(flags.sum())} of {len(flags)}", where)
+    return flags
+
+
+def _record_unused(
+    rows: list[CsvRow],
+    columns: _Columns,
+    datum: Heights | None,
+    crs: CRS,
+    record: Record,
+    *,
+    is_stated: bool,
+) -> None:
+    """Note the columns that are not read; refuse those whose statement would change the result."""
+    for place, head in columns.unused:
+        values = sorted({row.fields[place] for row in rows})
+        shown = ", ".join(values[:3])[:80]
+        where = f"column {head.text}"
+        statement = _STATEMENT.fullmatch(re.sub(r"[\W_]+", "", head.text.lower()))
+        if statement is None or not any(values):
+            record.not_used(head.subject, shown, where)
+        elif statement[1]:
+            if not {value.lower() for value in values} <= {"m", "metre", "metres", "meter", "meters"}:
+                raise FormatError(
+                    f"{columns.source}, {where}: expected metres, found {shown}; state the unit in the "
+                    "name of the column of heights, such as height_ft"
+                )
+            record.used(Subject.UNIT, shown, where)
+        elif statement[2]:
+            record.not_used(Subject.VERTICAL_DATUM, shown, where, f"heights above {datum}")
+        elif {value.lower() for value in values} <= _EARTH and not columns.on_map and crs == _WGS84:
+            record.used(Subject.HORIZONTAL_DATUM, shown, where)
+        elif is_stated or columns.on_map:
+            record.not_used(Subject.HORIZONTAL_DATUM, shown, where, f"taken as {crs.name}")
+        else:
+            raise FormatError(
+                f"{columns.source}, {where}: expected WGS 84 of lon and lat, found {shown}; state the "
+                "reference system (--crs)"
+            )
+
+
+def _corner_px(columns: _Columns, head: CsvHead, record: Record) -> float:
     """Line and sample of the centre of the first pixel; NaN where the file does not state its origin."""
-    if ("line" in places) != ("sample" in places):
-        raise FormatError(f"{source}: expected both columns line and sample, or none of them")
-    if origin is None:
+    if ("line" in columns.places) != ("sample" in columns.places):
+        raise FormatError(f"{columns.source}: expected both columns line and sample, or none of them")
+    stated = [(count, match[1]) for count, line in head.comments if (match := _ORIGIN.search(line))]
+    if not stated:
+        if "line" in columns.places:
+            record.not_used(
+                Subject.PIXEL_ORIGIN,
+                "none",
+                "columns line, sample",
+                "a first line '# pixel-origin=centre'",
+            )
         return math.nan
+    count, origin = stated[-1]
     if origin not in PIXEL_ORIGINS:
         raise FormatError(
-            f"{source}, line 1: {_ORIGIN}: expected one of {', '.join(PIXEL_ORIGINS)}, found "
-            f"{origin[:20]!r}"
+            f"{columns.source}, line {count}: pixel-origin: expected one of {', '.join(PIXEL_ORIGINS)}, "
+            f"found {origin[:20]!r}"
         )
+    record.used(Subject.PIXEL_ORIGIN, origin, f"line {count}")
     return PIXEL_ORIGINS[origin]
-
-
-def _crs(of_file: str | None, of_caller: str | None, source: str, *, on_map: bool) -> CRS:
-    definitions = [text for text in (of_file, of_caller) if text is not None]
-    if not on_map:
-        if definitions:
-            raise InputError(
-                f"{source}: {definitions[0][:40]} given as reference system of x and y, but the file "
-                "has lon and lat, degrees of WGS 84; leave --crs out, or name the columns x and y"
-            )
-        return CRS.from_epsg(4326)
-    if len(definitions) != 1:
-        found = " and ".join(text[:40] for text in definitions) or "none"
-        raise InputError(
-            f"{source}: expected one reference system of x and y, found {found}; state it (--crs), "
-            f"such as EPSG:32633, or in a first line '# {_CRS}=EPSG:32633'"
-        )
-    return parse_crs(definitions[0], source).to_2d()
-
-
-def _number(field: str, name: str, where: str) -> float:
-    return math.nan if field == "" else parse_number(field, name, where)
 
 
 def _name(field: str, where: str) -> str:
@@ -236,12 +417,12 @@ def _name(field: str, where: str) -> str:
     return field
 
 
-def _column(numbers: dict[str, Array], name: str, rows: list[dict[str, str]]) -> Array:
+def _column(numbers: dict[str, Array], name: str, rows: list[CsvRow]) -> Array:
     """The numbers of a column; NaN where the file has no such column."""
     return numbers.get(name, np.full(len(rows), np.nan))
 
 
-def _sigmas_m(numbers: dict[str, Array], rows: list[dict[str, str]], source: str) -> Array:
+def _sigmas_m(numbers: dict[str, Array], rows: list[CsvRow], source: str) -> Array:
     """Sigmas (n, 3) east, north, up."""
     sigmas = [_column(numbers, f"sigma_{axis}_m", rows) for axis in ("east", "north", "up")]
     if "sigma_horizontal_m" in numbers:
@@ -254,22 +435,52 @@ def _sigmas_m(numbers: dict[str, Array], rows: list[dict[str, str]], source: str
     return np.column_stack(sigmas)
 
 
+def _check_units(columns: _Columns, crs: CRS, record: Record) -> None:
+    """Refuse units of x and y other than those of their system, and heights whose unit is open."""
+    unit_m = horizontal_unit_m(crs)
+    for name in ("x", "y"):
+        head = columns.heads.get(name)
+        if head is not None and head.unit_m is not None and abs(head.unit_m / unit_m - 1.0) > 1e-5:
+            raise FormatError(
+                f"{columns.source}, column {head.text}: {head.unit_m:g} m is its unit, but {crs.name} "
+                f"has {crs.axis_info[0].unit_name}; state the reference system in that unit (--crs)"
+            )
+        if head is not None and head.unit_m is not None:
+            record.used(Subject.UNIT, str(crs.axis_info[0].unit_name), f"column {head.text}")
+    if columns.on_map:
+        north_first = crs.axis_info[0].direction == "north"
+        note = "the axes of the system are north, east" if north_first else ""
+        record.assumed(Subject.ORDER, "x is east, y is north", "columns x, y", note)
+    height = columns.heads.get("height_m")
+    if height is None:
+        return
+    if height.unit_m is not None:
+        record.used(Subject.UNIT, f"{height.unit_m:.8g} m", f"column {height.text}")
+    elif height.name == "height" and columns.on_map and unit_m != 1.0:
+        raise FormatError(
+            f"{columns.source}, column {height.text}: the unit of the heights is not stated, and that "
+            f"of {crs.name} is {crs.axis_info[0].unit_name}: name the column with its unit, such as "
+            f"{height.text}_m or {height.text}_ft"
+        )
+    else:
+        record.assumed(Subject.UNIT, "metres", f"column {height.text}")
+
+
 def _ground(
     numbers: dict[str, Array],
+    columns: _Columns,
     crs: CRS,
     heights: Heights | None,
-    wheres: list[str],
-    source: str,
-    *,
-    on_map: bool,
+    rows: list[CsvRow],
 ) -> Ground:
     """Points in WGS 84; points without a height need no vertical datum."""
-    names = ("x", "y") if on_map else ("lon", "lat")
-    height_m = numbers.get("height_m", np.full(len(wheres), np.nan))
-    for x, y, where in zip(numbers[names[0]], numbers[names[1]], wheres, strict=True):
+    names = ("x", "y") if columns.on_map else ("lon", "lat")
+    height_m = _column(numbers, "height_m", rows)
+    for x, y, row in zip(numbers[names[0]], numbers[names[1]], rows, strict=True):
         if math.isnan(x) or math.isnan(y):
-            raise FormatError(f"{where}: expected {names[0]} and {names[1]}, found an empty field")
-        if not on_map:
-            check_lon_lat(x, y, where)
+            raise FormatError(f"{row.where}: expected {names[0]} and {names[1]}, found an empty field")
+        if not columns.on_map:
+            check_lon_lat(x, y, row.where)
     points = np.column_stack([numbers[names[0]], numbers[names[1]], height_m])
-    return to_wgs84(points, crs, heights, source)
+    check_axes(points, crs, columns.source)
+    return to_wgs84(points, crs, heights, columns.source)

@@ -22,12 +22,14 @@ from amers.services.formats.gcp.marked_points import (
     marked_points,
     to_wgs84,
 )
+from amers.services.formats.gcp.record import Record
 from amers.services.formats.gcp.text_lines import (
     check_lon_lat,
     content_lines,
     coordinate_array,
     parse_numbers,
 )
+from amers.services.statements import Subject
 
 _FIELDS = [
     "point_id",
@@ -99,7 +101,16 @@ def parse_gcplib(text: str, heights: Heights | None = None, source: str = "GCPLi
     coordinates = coordinate_array([(lon, lat, height_m) for lon, lat, height_m in places])
     ground = to_wgs84(coordinates, WGS84_3D.to_2d(), heights, source)
     ids = [record.words["point_id"] for record in records]
-    return marked_points(ids, ground, np.full((len(ids), 2), np.nan))
+    found = Record(source)
+    found.assumed(Subject.HORIZONTAL_DATUM, "WGS 84", "latitude, longitude")
+    found.assumed(Subject.UNIT, "metres", "elevation")
+    if records:
+        note = "compared with latitude and longitude"
+        found.used(Subject.ORDER, "projection y before projection x", "", note)
+        found.not_used(Subject.EPOCH, str(records[0].acquired_on), "date", "of the image of the chip")
+        kinds = ", ".join(sorted({record.words["absolute_or_relative"] for record in records}))
+        found.not_used(Subject.ACCURACY, kinds, "absolute_or_relative")
+    return marked_points(ids, ground, np.full((len(ids), 2), np.nan), tuple(found.statements))
 
 
 def gcplib_records(text: str, source: str = "GCPLib") -> list[GcplibRecord]:

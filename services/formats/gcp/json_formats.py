@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -10,17 +11,19 @@ import numpy as np
 from pyproj import CRS
 
 from amers.services.errors import FormatError, InputError, VerticalDatumError
+from amers.services.formats.gcp.comments import check_axes, earth_crs
+from amers.services.formats.gcp.csv_columns import read_head
 from amers.services.formats.gcp.marked_points import (
-    Ground,
+    ELLIPSOID,
     MarkedPoints,
     horizontal_unit_m,
     marked_points,
-    parse_crs,
     to_wgs84,
 )
+from amers.services.formats.gcp.record import Record
 from amers.services.formats.gcp.text_lines import check_lon_lat
 from amers.services.formats.text_files import load_json
-from amers.services.statements import Statements, gathered
+from amers.services.statements import Subject, gathered
 from amers.services.types import Array, Measures
 
 OPF_FORMAT = "application/opf-input-control-points+json"
@@ -30,6 +33,10 @@ OPF_CORNER_PX = 0.5
 """OPF counts pixels from the corner of the first one."""
 OPF_EXTENSION = "AMERS_images"
 """Extension of OPF with the names of the images, which OPF itself stores in a separate camera list."""
+
+
+PIXEL_ORIGIN_OF_GEOJSON = "the centre of the first pixel is line 0, sample 0"
+HEIGHTS_OF_GEOJSON = "metres above the WGS 84 ellipsoid"
 
 
 def format_measures(measures: Measures, image: str, sigma_m: Array) -> str:
@@ -65,8 +72,8 @@ def format_measures(measures: Measures, image: str, sigma_m: Array) -> str:
     document = {
         "type": "FeatureCollection",
         "image": image,
-        "pixel_origin": "the centre of the first pixel is line 0, sample 0",
-        "heights": "metres above the WGS 84 ellipsoid",
+        "pixel_origin": PIXEL_ORIGIN_OF_GEOJSON,
+        "heights": HEIGHTS_OF_GEOJSON,
         "features": features,
     }
     return json.dumps(document, allow_nan=False) + "\n"
@@ -89,6 +96,9 @@ def measured_numbers(measures: Measures) -> dict[str, Array]:
 def parse_geojson_points(text: str, source: str = "GeoJSON") -> MarkedPoints:
     """The marked points of a GeoJSON: of a registration, of a user or of Orthority.
 
+    Positions are longitude and latitude of WGS 84, or in the reference system of the member `crs`, which
+    older GeoJSON has, east first.
+
     Each feature is a Point with longitude, latitude and height. Its properties are `line` and
     `sample`, from the centre of the first pixel, or Orthority's `ji` (column, row). Optional: `id`,
     `image` or `filename`, `sigma_px`, `sigma_east_m`, `sigma_north_m`, `sigma_up_m`, `check`, and
@@ -108,12 +118,26 @@ def parse_geojson_points(text: str, source: str = "GeoJSON") -> MarkedPoints:
     features = document.get("features")
     if document.get("type") != "FeatureCollection" or not isinstance(features, list):
         raise FormatError(f"{source}: expected a GeoJSON FeatureCollection")
+    record = Record(source)
+    crs = _geojson_crs(document, source, record)
     image = str(document.get("image") or "")
     rows = [
         _geojson_row(feature, f"{source}, feature {count}", image, str(count))
         for count, feature in enumerate(features, start=1)
     ]
-    return _points_from_rows(rows)
+    if crs is not None and rows:
+        given = np.array([row["lon_lat_h"] for row in rows])
+        check_axes(given, crs, source)
+        ground = to_wgs84(given, crs, None if crs.is_compound else ELLIPSOID, source)
+        record.statements += ground.statements
+        for row, position in zip(rows, ground.lon_lat_h.tolist(), strict=True):
+            row["lon_lat_h"] = position
+            row["sigma_m"][:2] = np.hypot(row["sigma_m"][:2], ground.sigma_m).tolist()
+    for count, row in enumerate(rows, start=1):
+        lon, lat, _ = row["lon_lat_h"]
+        check_lon_lat(lon, lat, f"{source}, feature {count}")
+    _record_properties(features, rows, record)
+    return _points_from_rows(rows, record)
 
 
 def format_opf(points: MarkedPoints) -> str:
@@ -197,11 +221,19 @@ def parse_opf(text: str, source: str = "OPF") -> MarkedPoints:
     extensions = document.get("extensions")
     names = extensions.get(OPF_EXTENSION) if isinstance(extensions, dict) else None
     images = names if isinstance(names, dict) else {}
+    record = Record(source)
     rows = []
     for count, gcp in enumerate(gcps, start=1):
-        rows += _opf_rows(gcp, images, f"{source}, gcp {count}")
-    statements = [one for row in rows for one in row.pop("statements")]
-    return _points_from_rows(rows, gathered(statements))
+        rows += _opf_rows(gcp, images, f"{source}, gcp {count}", record)
+    if document.get("mtps"):
+        record.not_used(Subject.IDENTITY, f"{len(document['mtps'])} manual tie points", "mtps")
+    if not images and any(row["image"] for row in rows):
+        note = "the ids of the cameras are taken as names of images"
+        record.assumed(Subject.IDENTITY, str(rows[0]["image"]), "camera_id", note)
+    record.assumed(Subject.PIXEL_ORIGIN, "the corner of the first pixel is 0, 0")
+    if any(row["check"] for row in rows):
+        record.used(Subject.VALIDITY, "check points", "is_checkpoint")
+    return _points_from_rows(rows, record)
 
 
 _NOT_MARKED = (math.nan, math.nan)
@@ -210,15 +242,77 @@ Row = dict[str, Any]
 """One mark: values by the attribute names of `MarkedPoints`."""
 
 
-def _points_from_rows(rows: list[Row], statements: Statements = ()) -> MarkedPoints:
+def _points_from_rows(rows: list[Row], record: Record) -> MarkedPoints:
     columns: dict[str, Any] = {name: [row[name] for row in rows] for name in rows[0]} if rows else {}
     return marked_points(
         columns.pop("id", []),
         columns.pop("lon_lat_h", []),
         columns.pop("line_sample", []),
-        statements,
+        gathered(record.statements),
         **columns,
     )
+
+
+_GEOJSON_STATEMENTS = {
+    "pixel_origin": (Subject.PIXEL_ORIGIN, PIXEL_ORIGIN_OF_GEOJSON),
+    "heights": (Subject.VERTICAL_DATUM, HEIGHTS_OF_GEOJSON),
+}
+_OF_AMERS = re.compile(r"predicted_\w+|residual_\w+|score|reason|views|info|image|filename|id")
+"""Properties that Amers or Orthority write for people."""
+_READ_PROPERTIES = {"ji", "line", "sample", "sigma_px", "sigma_east_m", "sigma_north_m", "sigma_up_m"}
+
+
+def _geojson_crs(document: dict[str, Any], source: str, record: Record) -> CRS | None:
+    """The system of the member `crs`; None for WGS 84. Notes what the collection states."""
+    for name, (subject, expected) in _GEOJSON_STATEMENTS.items():
+        if name in document and document[name] != expected:
+            raise FormatError(
+                f"{source}: {name}: expected {expected!r}, found {str(document[name])[:80]!r}"
+            )
+        if name in document:
+            record.used(subject, expected, name)
+    for name in ("coordRefSys", "coordinateEpoch", "epoch"):
+        if name in document:
+            subject = Subject.HORIZONTAL_DATUM if name == "coordRefSys" else Subject.EPOCH
+            record.not_used(subject, str(document[name])[:80], name)
+    if "pixel_origin" not in document:
+        record.assumed(Subject.PIXEL_ORIGIN, PIXEL_ORIGIN_OF_GEOJSON)
+    node = document.get("crs")
+    if node is None:
+        record.assumed(Subject.HORIZONTAL_DATUM, "WGS 84", "", "RFC 7946")
+        return None
+    properties = node.get("properties") if isinstance(node, dict) else None
+    definition = properties.get("name") if isinstance(properties, dict) else None
+    if not isinstance(definition, str):
+        raise FormatError(
+            f"{source}: crs: expected the name of a reference system, found {str(node)[:60]!r}"
+        )
+    crs = earth_crs(definition, f"{source}, crs")
+    return crs
+
+
+def _record_properties(features: list[Any], rows: list[Row], record: Record) -> None:
+    """Note the properties that are not read; refuses heights of 0 beside a property with others."""
+    properties = [feature.get("properties") or {} for feature in features]
+    names = {name: None for one in properties for name in one}
+    known = _READ_PROPERTIES | {"status", "check"}
+    for name in names:
+        if name in known or _OF_AMERS.fullmatch(name):
+            continue
+        head = read_head(name)
+        values = [one[name] for one in properties if one.get(name) is not None]
+        is_height = head.name == "height" or head.looks_like_height
+        if is_height and any(values) and rows and not any(row["lon_lat_h"][2] for row in rows):
+            raise VerticalDatumError(
+                f"{record.file}: the coordinates have heights of 0, and the property {name!r} others "
+                f"such as {str(values[0])[:20]}; write heights above the ellipsoid into the coordinates"
+            )
+        subject = Subject.VERTICAL_DATUM if is_height else head.subject
+        record.not_used(subject, ", ".join(dict.fromkeys(map(str, values[:3])))[:80], f"property {name}")
+    if {"status", "check"} & set(names):
+        record.used(Subject.VALIDITY, "switched off and check points", "properties status, check")
+    if any("sigma" in name for name in names):
+        record.used(Subject.ACCURACY, "sigmas", "properties")
 
 
 def _geojson_row(feature: Any, where: str, image: str, count: str) -> Row:
@@ -232,7 +326,6 @@ def _geojson_row(feature: Any, where: str, image: str, count: str) -> Row:
     if isinstance(coordinates, list) and len(coordinates) == 2:
         raise VerticalDatumError(f"{where}: expected longitude, latitude and height, found 2 numbers")
     lon, lat, height_m = _numbers(coordinates, 3, "coordinates", where)
-    check_lon_lat(lon, lat, where)
     position = properties.get("ji", [properties.get("sample"), properties.get("line")])
     sample, line = _NOT_MARKED
     if position != [None, None]:
@@ -256,7 +349,7 @@ def _geojson_row(feature: Any, where: str, image: str, count: str) -> Row:
     }
 
 
-def _opf_rows(gcp: Any, images: dict[str, Any], where: str) -> list[Row]:
+def _opf_rows(gcp: Any, images: dict[str, Any], where: str, record: Record) -> list[Row]:
     """The marks of one point, or one row without a mark."""
     if not isinstance(gcp, dict) or not isinstance(gcp.get("geolocation"), dict):
         raise FormatError(f"{where}: expected a geolocation")
@@ -265,13 +358,11 @@ def _opf_rows(gcp: Any, images: dict[str, Any], where: str) -> list[Row]:
     location, marks = gcp["geolocation"], gcp.get("marks")
     if not isinstance(marks, list) or not all(isinstance(mark, dict) for mark in marks):
         raise FormatError(f"{where}: expected a list of marks")
-    ground, sigma_m = _opf_ground(location, where)
-    file = where.rpartition(", gcp ")[0]
+    ground, sigma_m = _opf_ground(location, where, record)
     point = {
         "id": str(gcp.get("id")),
-        "lon_lat_h": ground.lon_lat_h[0],
-        "sigma_m": [*(math.hypot(sigma, ground.sigma_m) for sigma in sigma_m[:2]), sigma_m[2]],
-        "statements": [replace(one, file=file) for one in ground.statements],
+        "lon_lat_h": ground,
+        "sigma_m": sigma_m,
         "check": gcp.get("is_checkpoint") is True,
     }
     unmarked = {"line_sample": _NOT_MARKED, "image": "", "sigma_px": math.nan}
@@ -290,12 +381,20 @@ def _opf_rows(gcp: Any, images: dict[str, Any], where: str) -> list[Row]:
     return rows
 
 
-def _opf_ground(location: dict[str, Any], where: str) -> tuple[Ground, list[float]]:
+def _opf_ground(location: dict[str, Any], where: str, record: Record) -> tuple[list[float], list[float]]:
     """Longitude, latitude, height and the sigmas east, north, up of a geolocation."""
     crs_node = location.get("crs")
     if not isinstance(crs_node, dict) or not isinstance(crs_node.get("definition"), str):
         raise FormatError(f"{where}: expected a crs with a definition")
-    crs = parse_crs(crs_node["definition"], where)
+    crs = earth_crs(crs_node["definition"], where)
+    record.used(Subject.ORDER, ", ".join(axis.abbrev for axis in crs.axis_info[:2]), "crs")
+    if len(crs.axis_info) < 3:
+        record.assumed(Subject.VERTICAL_DATUM, ELLIPSOID, "crs", "OPF: of a system without heights")
+    record.used(Subject.UNIT, str(crs.axis_info[-1].unit_name), "crs")
+    record.used(Subject.ACCURACY, "sigmas", "geolocation")
+    for name in ("epoch", "coordinate_epoch"):
+        if name in crs_node:
+            record.not_used(Subject.EPOCH, str(crs_node[name])[:40], "crs")
     coordinates = np.array([_numbers(location.get("coordinates"), 3, "coordinates", where)])
     sigmas = _numbers(location.get("sigmas"), 3, "sigmas", where)
     geoid_m = _optional(crs_node, "geoid_height", where)
@@ -307,9 +406,13 @@ def _opf_ground(location: dict[str, Any], where: str) -> tuple[Ground, list[floa
         crs = crs.sub_crs_list[0]
     elif len(crs.axis_info) < 3:
         coordinates[:, 2] *= unit_m
-    heights = None if crs.is_compound else "ellipsoid"
+    check_axes(coordinates if _east_first(crs) else coordinates[:, [1, 0, 2]], crs, where)
+    heights = None if crs.is_compound else ELLIPSOID
     ground = to_wgs84(coordinates, crs, heights, where, axes_of_crs=True)
-    return ground, [east * unit_m, north * unit_m, sigmas[2] * up_unit_m]
+    record.statements += [replace(one, file=record.file) for one in ground.statements]
+    datum_m = ground.sigma_m
+    sigmas_m = [math.hypot(east * unit_m, datum_m), math.hypot(north * unit_m, datum_m)]
+    return ground.lon_lat_h[0].tolist(), [*sigmas_m, sigmas[2] * up_unit_m]
 
 
 def _east_first(crs: CRS) -> bool:

@@ -121,7 +121,8 @@ def marked_points(
     """Marked points with default attributes: unknown sigmas and residuals, active, no check points.
 
     Args:
-        id, lon_lat_h, line_sample: n rows; the sigma and the statements of a `Ground` are added.
+        id, lon_lat_h, line_sample: n rows; the sigma and the statements of a `Ground` are added,
+            but none on a subject that the reader found itself.
         statements: of the file.
         attributes: other attributes of `MarkedPoints`, n rows, that replace the defaults.
     """
@@ -143,7 +144,11 @@ def marked_points(
         horizontal_m = columns["sigma_m"][:, :2]
         horizontal_m[:] = np.copysign(np.hypot(horizontal_m, lon_lat_h.sigma_m), horizontal_m)
         datum_sigma_m = lon_lat_h.sigma_m
-        statements = (*statements, *lon_lat_h.statements)
+        known = {one.subject for one in statements if one.use is not Use.NOT_USED}
+        of_ground = [
+            one for one in lon_lat_h.statements if one.use is not Use.USED or one.subject not in known
+        ]
+        statements = (*statements, *of_ground)
         lon_lat_h = lon_lat_h.lon_lat_h
     return MarkedPoints(
         id=np.array(id, dtype=np.str_),
@@ -207,11 +212,7 @@ def _height_datum(
 ) -> HeightDatum:
     """Unit and datum of heights that a reference system or the caller states; else they are metres."""
     if heights is None and not crs.is_compound:
-        raise VerticalDatumError(
-            f"{source}: the file does not state the datum of its heights; state it (--vertical): "
-            f"{ELLIPSOID!r} or a vertical reference system such as 'EGM96' or 'EPSG:3855' (EGM2008), or "
-            "the grid file of a geoid (--geoid)"
-        )
+        raise no_datum(source)
     vertical, grid = (None, heights) if isinstance(heights, Path) else (heights, None)
     caller = HeightsByCaller(vertical, grid)
     try:
@@ -249,6 +250,15 @@ def _of_three_axes(crs: CRS, source: str) -> Statements:
 
 def _without(ground: Array, missing: BoolArray) -> Array:
     return np.column_stack([ground[:, :2], np.where(missing, np.nan, ground[:, 2])])
+
+
+def no_datum(source: str) -> VerticalDatumError:
+    """The error of a file whose heights have no datum, with the options that state it."""
+    return VerticalDatumError(
+        f"{source}: the file does not state the datum of its heights; state it (--vertical): "
+        f"{ELLIPSOID!r} or a vertical reference system such as 'EGM96' or 'EPSG:3855' (EGM2008), or "
+        "the grid file of a geoid (--geoid)"
+    )
 
 
 def horizontal_unit_m(crs: CRS) -> float:

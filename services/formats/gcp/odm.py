@@ -7,28 +7,38 @@ positions from the image centre: the centre of the first pixel is (0, 0).
 import math
 import re
 
+import numpy as np
 from pyproj import CRS
 
 from amers.services.errors import FormatError
+from amers.services.formats.gcp.comments import (
+    agreed_heights,
+    check_axes,
+    comment_lines,
+    earth_crs,
+    read_comments,
+)
 from amers.services.formats.gcp.marked_points import (
     Ground,
     Heights,
     MarkedPoints,
     horizontal_unit_m,
     marked_points,
-    parse_crs,
     to_wgs84,
 )
+from amers.services.formats.gcp.record import Record
 from amers.services.formats.gcp.text_lines import (
     content_lines,
     coordinate_array,
     format_mark,
     parse_numbers,
 )
+from amers.services.statements import Subject
 
 _UTM = re.compile(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS]?)", re.IGNORECASE)
 _DEFINITION = re.compile(r"EPSG:\d+(?:\+\S+)?|\+(?:proj|init)\s*=.*", re.IGNORECASE)
 _NAMES = ["geo_x", "geo_y", "geo_z", "im_x", "im_y"]
+_IMAGE_ENDING = re.compile(r"\.(?:jpe?g|tiff?|png|jp2|img|ntf|nitf|dng|heic|webp|bmp)$", re.IGNORECASE)
 _CHECK = "CHK-"
 """Prefix of the names of check points."""
 
@@ -77,10 +87,17 @@ def parse_gcp_list(
     if not lines:
         raise FormatError(f"{source}: expected a reference system in the first line, found nothing")
     crs = _crs(lines[0][1], source)
+    comments = read_comments(comment_lines(text, "#"), source)
+    if comments.crs is not None and comments.crs != crs:
+        raise FormatError(
+            f"{source}: {comments.crs.name} stated in a comment, {crs.name} in the first line; expected "
+            "one reference system: remove the comment, or correct the first line"
+        )
+    record = Record(source, list(comments.statements))
     ids, coordinates, pixels, images = [], [], [], []
     unnamed: dict[tuple[str, ...], str] = {}
     for where, line in lines[1:]:
-        fields = line.split()
+        fields = _fields(line)
         if len(fields) < 6:
             raise FormatError(
                 f"{where}: expected {', '.join(_NAMES)}, image_name and optionally gcp_name, "
@@ -92,14 +109,31 @@ def parse_gcp_list(
         coordinates.append((x, y, _height(fields[2], where)))
         pixels.append((row, column))
         images.append(fields[5])
+        if fields[7:]:
+            record.not_used(Subject.IDENTITY, " ".join(fields[7:])[:60], where.rpartition(", ")[2])
     check = [name.upper().startswith(_CHECK) for name in ids]
+    ground = _ground(coordinates, crs, agreed_heights(comments.heights, heights, source), record)
+    if any(check):
+        record.used(Subject.VALIDITY, f"{sum(check)} check points", f"names with {_CHECK}")
+    record.assumed(Subject.PIXEL_ORIGIN, "the centre of the first pixel is 0, 0")
     return marked_points(
         [name[len(_CHECK) :] if held_out else name for name, held_out in zip(ids, check, strict=True)],
-        _ground(coordinates, crs, heights, source),
+        ground,
         pixels,
+        statements=tuple(record.statements),
         image=images,
         check=check,
     )
+
+
+def _fields(line: str) -> list[str]:
+    """The fields of a mark; the name of an image may have spaces, up to its ending."""
+    fields = line.split("\t") if line.count("\t") >= 5 else line.split()
+    fields = [field.strip() for field in fields]
+    ends = [place for place, field in enumerate(fields) if place >= 5 and _IMAGE_ENDING.search(field)]
+    if ends:
+        fields[5 : ends[0] + 1] = [" ".join(fields[5 : ends[0] + 1])]
+    return fields
 
 
 def _height(field: str, where: str) -> float:
@@ -107,13 +141,18 @@ def _height(field: str, where: str) -> float:
 
 
 def _ground(
-    coordinates: list[tuple[float, float, float]], crs: CRS, heights: Heights | None, source: str
+    coordinates: list[tuple[float, float, float]], crs: CRS, heights: Heights | None, record: Record
 ) -> Ground:
     """Points in WGS 84; points without a height have none here, and need no vertical datum."""
     points = coordinate_array(coordinates)
+    check_axes(points, crs, record.file)
+    missing = np.isnan(points[:, 2])
     if len(crs.axis_info) < 3:
         points[:, 2] *= horizontal_unit_m(crs)
-    return to_wgs84(points, crs, heights, source)
+        if not missing.all():
+            unit = crs.axis_info[0].unit_name if crs.is_projected else "metre"
+            record.assumed(Subject.UNIT, unit, "heights", "the unit of the reference system")
+    return to_wgs84(points, crs, heights, record.file)
 
 
 def _crs(line: str, source: str) -> CRS:
@@ -121,4 +160,4 @@ def _crs(line: str, source: str) -> CRS:
     utm = _UTM.fullmatch(line)
     if utm is not None and 1 <= int(utm[1]) <= 60:
         return CRS.from_epsg((32700 if utm[2].upper() == "S" else 32600) + int(utm[1]))
-    return parse_crs(line, source)
+    return earth_crs(line, source)

@@ -13,14 +13,21 @@ import re
 import numpy as np
 
 from amers.services.errors import FormatError
+from amers.services.formats.gcp.comments import (
+    agreed_heights,
+    check_axes,
+    comment_lines,
+    earth_crs,
+    read_comments,
+)
 from amers.services.formats.gcp.marked_points import (
     ELLIPSOID,
     Heights,
     MarkedPoints,
     marked_points,
-    parse_crs,
     to_wgs84,
 )
+from amers.services.formats.gcp.record import Record
 from amers.services.formats.gcp.text_lines import (
     content_lines,
     coordinate_array,
@@ -30,6 +37,7 @@ from amers.services.formats.gcp.text_lines import (
     parse_numbers,
     sequential_ids,
 )
+from amers.services.statements import Subject
 
 PCI_CORNER_PX = 0.5
 """PCI counts pixels from the corner of the first one."""
@@ -86,6 +94,12 @@ def parse_pci_text(text: str, heights: Heights | None = None, source: str = "PCI
         )
     layout, definition, stated_heights = header.groups()
     columns = _columns(layout, source)
+    comments = read_comments(comment_lines(text, "#"), source)
+    crs = earth_crs(definition, source)
+    record = Record(source, list(comments.statements))
+    record.used(Subject.ORDER, layout, "line 1")
+    if stated_heights is not None:
+        record.used(Subject.VERTICAL_DATUM, stated_heights, "line 1")
     rows = []
     for where, line in content_lines(text, "#", source):
         fields = [field.strip('"') for field in _FIELD.findall(line)]
@@ -96,14 +110,22 @@ def parse_pci_text(text: str, heights: Heights | None = None, source: str = "PCI
         rows.append(_Row(dict(zip(columns, fields, strict=True)), where))
     coordinates = coordinate_array([(row.number("X"), row.number("Y"), row.number("Z")) for row in rows])
     pixels = [(row.number("L") - PCI_CORNER_PX, row.number("P") - PCI_CORNER_PX) for row in rows]
-    crs = parse_crs(definition, source)
-    if "Z" not in columns:
-        crs = crs.to_2d()
-    ground = to_wgs84(coordinates, crs, stated_heights or heights, source)
+    check_axes(coordinates, crs, source)
+    datum = agreed_heights(stated_heights or comments.heights, heights, source)
+    ground = to_wgs84(coordinates, crs if "Z" in columns else crs.to_2d(), datum, source)
+    if "Z" in columns:
+        record.assumed(Subject.UNIT, "metres", "column Z")
+    record.assumed(Subject.PIXEL_ORIGIN, "the corner of the first pixel is 0, 0")
+    errors = [name for name in ("eX", "eY", "eZ") if name in columns]
+    if errors:
+        record.not_used(Subject.ACCURACY, ", ".join(errors), "", "PCI defines them in pixels")
+    if "S" in columns:
+        record.used(Subject.VALIDITY, "G, I, C", "column S")
     return marked_points(
         [row.fields["ID"] for row in rows] if "ID" in columns else sequential_ids(pixels),
         ground,
         pixels,
+        statements=tuple(record.statements),
         sigma_px=[math.hypot(row.number("eP"), row.number("eL")) / math.sqrt(2.0) for row in rows],
         active=[row.status != "I" for row in rows],
         check=[row.status == "C" for row in rows],

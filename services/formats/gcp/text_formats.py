@@ -9,14 +9,20 @@ import numpy as np
 from pyproj import CRS
 
 from amers.services.errors import FormatError, InputError
+from amers.services.formats.gcp.comments import (
+    agreed_heights,
+    check_axes,
+    comment_lines,
+    read_comments,
+)
 from amers.services.formats.gcp.marked_points import (
     WGS84_3D,
     Heights,
     MarkedPoints,
     marked_points,
-    parse_crs,
     to_wgs84,
 )
+from amers.services.formats.gcp.record import Record
 from amers.services.formats.gcp.text_lines import (
     check_lon_lat,
     content_lines,
@@ -30,9 +36,12 @@ from amers.services.formats.gcp.text_lines import (
 )
 from amers.services.formats.text_files import NUMBER_PATTERN
 from amers.services.geodesy import ecef_from_east_north_up
+from amers.services.statements import Subject
 
 QGIS_CORNER_PX = 0.5
 """QGIS, like GDAL, counts pixels from the corner of the first one."""
+_ABOVE_IMAGE_PX = 200_000.0
+"""No mark of QGIS lies so far above its image: it is a map coordinate."""
 ENVI_CORNER_PX = 1.5
 """The corner of the first pixel is (1, 1) in ENVI, hence its centre (1.5, 1.5)."""
 
@@ -44,8 +53,13 @@ _ASP_FIXED_M = 1e-9
 _QGIS_COLUMNS = ["mapX", "mapY", "sourceX", "sourceY"]
 _OLDER_QGIS_COLUMNS = ["mapX", "mapY", "pixelX", "pixelY"]
 _ENVI_WGS84 = r"WGS[- ]?84"
-_ENVI_UTM = re.compile(rf"UTM\s*,\s*(\d+)\s*,\s*(North|South)\s*,\s*{_ENVI_WGS84}\b", re.IGNORECASE)
-_ENVI_GEOGRAPHIC = re.compile(rf"Geographic Lat/Lon\s*,\s*{_ENVI_WGS84}\b", re.IGNORECASE)
+_ENVI_UTM = re.compile(
+    rf"UTM\s*,\s*(\d+)\s*,\s*(North|South)\s*,\s*{_ENVI_WGS84}\s*(?:,\s*units\s*=\s*(\S+))?",
+    re.IGNORECASE,
+)
+_ENVI_GEOGRAPHIC = re.compile(
+    rf"Geographic Lat/Lon\s*,\s*{_ENVI_WGS84}\s*(?:,\s*units\s*=\s*(\S+))?", re.IGNORECASE
+)
 
 
 def format_asp_gcp(points: MarkedPoints) -> str:
@@ -81,11 +95,16 @@ def format_asp_gcp(points: MarkedPoints) -> str:
 def is_asp_gcp(text: str) -> bool:
     """Whether the first lines of a text, after comments, have fields as a point of ASP has."""
     for _, line in islice(content_lines(text, "#", ""), 5):
-        fields = line.replace(",", " ").split()
+        fields = _asp_fields(line)
         numbers = [re.fullmatch(NUMBER_PATTERN, field) is not None for field in fields]
         if len(fields) >= 12 and all(numbers[1:7]) and not numbers[7] and all(numbers[8:12]):
             return True
     return False
+
+
+def _asp_fields(line: str) -> list[str]:
+    """The fields of a point, without a comment after them."""
+    return re.split(r"\s#", line, maxsplit=1)[0].replace(",", " ").split()
 
 
 def parse_asp_gcp(
@@ -93,9 +112,10 @@ def parse_asp_gcp(
 ) -> MarkedPoints:
     """The marked points of an ASP `.gcp`: one point on each line, with all its marks.
 
-    The three sigmas are those of x, y, z of ECEF, unless ASP is called with
-    `--use-lon-lat-height-gcp-error`. A comment with that option in the file counts as a statement. Equal
-    sigmas mean the same in both. Sigmas of 1e-10 m mark fixed points, not an accuracy: they are unknown.
+    A comment may state the datum: `# WKT: GEOGCS[...]`, or `--datum`; without one it is WGS 84. The
+    three sigmas are those of x, y, z of ECEF, unless ASP is called with the option
+    `--use-lon-lat-height-gcp-error`; a comment with it counts as a statement. Equal sigmas mean the same
+    in both. Sigmas of 1e-10 m mark fixed points, not an accuracy: they are unknown.
 
     Args:
         text: contents of the file; spaces or commas separate fields.
@@ -110,10 +130,13 @@ def parse_asp_gcp(
     """
     if sigmas is None and re.search(r"^#.*--use-lon-lat-height-gcp-error", text, re.MULTILINE):
         sigmas = LAT_LON_HEIGHT
+    record = Record(source)
+    crs, datum = _asp_datum(text, heights, source, record)
     ids, coordinates, sigmas_m, images, pixels, sigmas_px = [], [], [], [], [], []
+    of_ground = []
     for where, line in content_lines(text, "#", source):
-        fields = line.replace(",", " ").split()
-        if len(fields) < 12 or (len(fields) - 7) % 5:
+        fields = _asp_fields(line)
+        if len(fields) < 7 or (len(fields) - 7) % 5:
             raise FormatError(
                 f"{where}: expected id, lat, lon, height, 3 sigmas, then name, column, row and 2 sigmas "
                 f"for each image, found {len(fields)} fields"
@@ -126,19 +149,73 @@ def parse_asp_gcp(
             raise FormatError(
                 f"{where}: sigmas on the ground: expected positive metres, found {' '.join(fields[4:7])}"
             )
+        of_ground.append(of_ground_m)
         of_point_m = _east_north_up_sigmas(of_ground_m, lon, lat, sigmas)
-        for start in range(7, len(fields), 5):
-            column, row, sigma_column, sigma_row = parse_numbers(
-                fields[start + 1 : start + 5], ["column", "row", "sigma_column", "sigma_row"], where
-            )
+        for image, row, column, sigma_px in _asp_marks(fields[7:], where):
             ids.append(fields[0])
             coordinates.append((lon, lat, height_m))
             sigmas_m.append(of_point_m)
-            images.append(fields[start])
+            images.append(image)
             pixels.append((row, column))
-            sigmas_px.append(math.sqrt((sigma_column**2 + sigma_row**2) / 2.0))
-    ground = to_wgs84(coordinate_array(coordinates), WGS84_3D.to_2d(), heights, source)
-    return marked_points(ids, ground, pixels, sigma_m=sigmas_m, image=images, sigma_px=sigmas_px)
+            sigmas_px.append(sigma_px)
+    points = coordinate_array(coordinates)
+    check_axes(points, crs, source)
+    ground = to_wgs84(points, crs.to_2d(), datum, source)
+    record.assumed(Subject.UNIT, "metres", "heights and sigmas")
+    record.assumed(Subject.PIXEL_ORIGIN, "the centre of the first pixel is 0, 0")
+    of_sigmas = np.array(sigmas_m)
+    if len(ids) and np.isnan(of_sigmas).all():
+        note = "their axes are not stated: --sigma-axes"
+        if all(max(of_point) <= _ASP_FIXED_M for of_point in of_ground):
+            note = "points that ASP keeps fixed"
+        record.not_used(Subject.ACCURACY, "sigmas on the ground", "", note)
+    elif len(ids):
+        record.used(Subject.ACCURACY, f"sigmas {sigmas or 'equal in all axes'}")
+    return marked_points(
+        ids,
+        ground,
+        pixels,
+        statements=tuple(record.statements),
+        sigma_m=sigmas_m,
+        image=images,
+        sigma_px=sigmas_px,
+    )
+
+
+def _asp_marks(fields: list[str], where: str) -> list[tuple[str, float, float, float]]:
+    """Image, row, column and sigma of each mark of a point; one without a position where it has none."""
+    marks = []
+    for start in range(0, len(fields), 5):
+        column, row, sigma_column, sigma_row = parse_numbers(
+            fields[start + 1 : start + 5], ["column", "row", "sigma_column", "sigma_row"], where
+        )
+        sigma_px = math.sqrt((sigma_column**2 + sigma_row**2) / 2.0)
+        marks.append((fields[start], row, column, sigma_px))
+    return marks or [("", math.nan, math.nan, math.nan)]
+
+
+def _asp_datum(
+    text: str, heights: Heights | None, source: str, record: Record
+) -> tuple[CRS, Heights | None]:
+    """The geographic system of the points, and the datum of their heights, by comments and caller."""
+    comments = read_comments(comment_lines(text, "#"), source)
+    record.statements += comments.statements
+    for count, line in comment_lines(text, "#"):
+        names = re.findall(r"\b(?:lat|lon|long)", line.lower())
+        if line.lower().startswith("id") and names[:1] in (["lon"], ["long"]):
+            raise FormatError(
+                f"{source}, line {count}: the order {line[:60]!r} stated, expected latitude before "
+                "longitude as ASP reads them; exchange the columns"
+            )
+    if comments.crs is None:
+        record.assumed(Subject.HORIZONTAL_DATUM, "WGS 84", "", "a line '# WKT: ...' states another")
+    crs = comments.crs or WGS84_3D
+    if not crs.is_geographic:
+        raise FormatError(
+            f"{source}: {crs.name} stated in a comment, but points of ASP have latitude and longitude; "
+            "expected a geographic system, or give the points as CSV with x and y"
+        )
+    return crs, agreed_heights(comments.heights, heights, source)
 
 
 def _east_north_up_sigmas(
@@ -204,24 +281,51 @@ def parse_qgis_points(text: str, source: str = "points file") -> MarkedPoints:
     columns = lines[0][1].split(",")[:4] if lines else []
     if columns not in (_QGIS_COLUMNS, _OLDER_QGIS_COLUMNS):
         raise FormatError(f"{source}: expected a line that starts with {','.join(_QGIS_COLUMNS)}")
-    header = re.match(r"#CRS: *(\S.*)", text)
-    if header is None:
+    comments = read_comments(comment_lines(text, "#"), source)
+    crs = comments.crs
+    if crs is None:
         raise FormatError(
             f"{source}: the file does not state its reference system, as those of older versions of "
             "QGIS; add it as a first line such as '#CRS: EPSG:32633'"
         )
-    crs = parse_crs(header[1].strip(), source)
+    names = lines[0][1].split(",")
+    record = Record(source, list(comments.statements))
     coordinates, pixels, active = [], [], []
     for where, line in lines[1:]:
         fields = next(csv.reader([line]))
-        if len(fields) < 5:
-            raise FormatError(f"{where}: expected at least 5 fields, found {len(fields)}")
-        x, y, column, minus_row = parse_numbers(fields[:4], _QGIS_COLUMNS, where)
+        if not 5 <= len(fields) <= max(len(names), 5):
+            raise FormatError(
+                f"{where}: expected {len(names)} fields with decimal points, found {len(fields)}"
+            )
+        x, y, column, minus_row = parse_numbers(fields[:4], names[:4], where)
+        if minus_row > _ABOVE_IMAGE_PX:
+            raise FormatError(
+                f"{where}: {names[3]}: expected 0 or less, as QGIS counts the lines of an image without "
+                f"a map, found {minus_row:g}, a coordinate of an image that is on a map or a line "
+                "that counts downwards; mark the points in the raw image"
+            )
         coordinates.append((x, y, math.nan))
         pixels.append((-minus_row - QGIS_CORNER_PX, column - QGIS_CORNER_PX))
-        active.append(fields[4].strip() != "0")
-    ground = to_wgs84(coordinate_array(coordinates), crs.to_2d(), None, source)
-    return marked_points(sequential_ids(pixels), ground, pixels, active=active)
+        active.append(_is_enabled(fields[4], where))
+    points = coordinate_array(coordinates)
+    check_axes(points, crs, source)
+    ground = to_wgs84(points, crs.to_2d(), None, source)
+    record.assumed(Subject.PIXEL_ORIGIN, "the corner of the first pixel is 0, 0, lines negative")
+    record.used(Subject.VALIDITY, f"{sum(active)} of {len(active)} points enabled", "column enable")
+    if len(names) > 5:
+        record.not_used(Subject.ACCURACY, ", ".join(names[5:]), "", "residuals of a fit in QGIS")
+    return marked_points(
+        sequential_ids(pixels), ground, pixels, statements=tuple(record.statements), active=active
+    )
+
+
+def _is_enabled(field: str, where: str) -> bool:
+    word = field.strip().lower()
+    if word in ("1", "1.0", "true", "yes"):
+        return True
+    if word in ("0", "0.0", "false", "no"):
+        return False
+    raise FormatError(f"{where}: enable: expected 1 or 0, found {field[:20]!r}")
 
 
 def format_envi_pts(points: MarkedPoints) -> str:
@@ -261,7 +365,16 @@ def parse_envi_pts(
         FormatError: a line has another form, or the projection is not supported.
         VerticalDatumError: the caller does not state the datum of the heights.
     """
-    crs = _envi_crs(text, source)
+    record = Record(source)
+    crs = _envi_crs(text, source, record)
+    described = [line for line in comment_lines(text, ";") if not line[1].startswith("projection info")]
+    comments = read_comments(described, source)
+    if comments.crs is not None:
+        raise FormatError(
+            f"{source}: {comments.crs.name} stated in a comment beside the projection info; expected "
+            "one reference system: remove the comment"
+        )
+    record.statements += comments.statements
     names = ["map x", "map y", "elevation", "image x", "image y"]
     if re.search(r"^;\s*Map\s*\(\s*x\s*,\s*y\s*\)", text, re.MULTILINE | re.IGNORECASE):
         names.remove("elevation")
@@ -274,22 +387,35 @@ def parse_envi_pts(
         coordinates.append((values["map x"], values["map y"], values.get("elevation", math.nan)))
         pixels.append((values["image y"] - ENVI_CORNER_PX, values["image x"] - ENVI_CORNER_PX))
     points = coordinate_array(coordinates)
-    ground = to_wgs84(points, crs, heights, source)
-    return marked_points(sequential_ids(pixels), ground, pixels)
+    check_axes(points, crs, source)
+    ground = to_wgs84(points, crs, agreed_heights(comments.heights, heights, source), source)
+    if "elevation" in names:
+        record.assumed(Subject.UNIT, "metres", "elevations")
+    record.assumed(Subject.PIXEL_ORIGIN, "the corner of the first pixel is 1, 1")
+    return marked_points(sequential_ids(pixels), ground, pixels, tuple(record.statements))
 
 
-def _envi_crs(text: str, source: str) -> CRS:
+def _envi_crs(text: str, source: str, record: Record) -> CRS:
     info = re.search(r"^;\s*projection info\s*=\s*\{([^}\n]*)\}", text, re.MULTILINE)
     projection = info[1].strip() if info else ""
-    utm = _ENVI_UTM.match(projection)
-    if utm is not None and 1 <= int(utm[1]) <= 60:
-        return CRS.from_epsg((32600 if utm[2].lower() == "north" else 32700) + int(utm[1]))
-    if _ENVI_GEOGRAPHIC.match(projection):
-        return CRS.from_epsg(4326)
-    raise FormatError(
-        f"{source}: projection info: expected Geographic Lat/Lon or UTM with WGS-84, "
-        f"found {projection[:60] or 'none'!r}"
-    )
+    utm, geographic = _ENVI_UTM.fullmatch(projection), _ENVI_GEOGRAPHIC.fullmatch(projection)
+    crs = None
+    if (
+        utm is not None
+        and 1 <= int(utm[1]) <= 60
+        and (utm[3] or "meters").lower() in ("meters", "metres")
+    ):
+        crs = CRS.from_epsg((32600 if utm[2].lower() == "north" else 32700) + int(utm[1]))
+    if geographic is not None and (geographic[1] or "degrees").lower() == "degrees":
+        crs = CRS.from_epsg(4326)
+    if crs is None:
+        raise FormatError(
+            f"{source}: projection info: expected Geographic Lat/Lon in degrees or UTM in metres with "
+            f"WGS-84, found {projection[:60] or 'none'!r}"
+        )
+    if "units" in projection:
+        record.used(Subject.UNIT, projection.rpartition("=")[2], "projection info")
+    return crs
 
 
 def _rows_of_each_point(points: MarkedPoints) -> list[list[int]]:
