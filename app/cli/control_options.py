@@ -66,7 +66,11 @@ class ControlOptions:
         geoid_or_datum = self.control_geoid or self.control_vertical
         points = PointStatements(
             stated_by_caller(
-                geoid_or_datum, self.control_crs, self.control_columns, self.control_sigma_axes
+                geoid_or_datum,
+                self.control_crs,
+                self.control_columns,
+                self.control_sigma_axes,
+                "--control-",
             ),
             sigma_pair(self.control_sigma_m, "--control-sigma-m"),
             sigma_pair(self.control_frame_sigma_m, "--control-frame-sigma-m"),

@@ -9,7 +9,11 @@ from amers.services.formats.gcp.text_formats import ECEF, LAT_LON_HEIGHT
 
 
 def stated_by_caller(
-    heights: str | Path | None, crs: str | None, columns: str | None, sigma_axes: str | None
+    heights: str | Path | None,
+    crs: str | None,
+    columns: str | None,
+    sigma_axes: str | None,
+    options: str = "--",
 ) -> StatedByCaller:
     """What the options of a command state about a file of points.
 
@@ -18,6 +22,7 @@ def stated_by_caller(
         crs: reference system of x and y of a CSV.
         columns: of a CSV: lon=COLUMN,lat=COLUMN,…
         sigma_axes: of the sigmas of an ASP file.
+        options: first letters of these options.
 
     Raises:
         InputError: the axes or the columns are wrong.
@@ -27,7 +32,7 @@ def stated_by_caller(
             f"axes of sigmas: {sigma_axes[:40]!r} found, {ECEF} or {LAT_LON_HEIGHT} expected"
         )
     layout = CsvLayout({} if columns is None else parse_columns(columns), crs)
-    return StatedByCaller(heights, sigma_axes, layout)
+    return StatedByCaller(heights, sigma_axes, layout, options)
 
 
 def sigma_pair(text: str | None, option: str) -> tuple[float, float] | None:

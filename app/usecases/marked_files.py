@@ -9,9 +9,15 @@ import numpy as np
 
 from amers.app.errors import InputError
 from amers.services.datums import filled_sigmas
+from amers.services.errors import refuse_unstated
 from amers.services.formats.addresses import FilePlace
 from amers.services.formats.gcp.marked_points import MarkedPoints
-from amers.services.formats.gcp.reader import StatedByCaller, read_marked_ground
+from amers.services.formats.gcp.reader import (
+    StatedByCaller,
+    read_marked_ground,
+    read_or_missing,
+)
+from amers.services.imagery.marks import check_marks_inside, check_not_exchanged
 from amers.services.imagery.scene import Scene
 from amers.services.production.marked_control import MarkedGround
 from amers.services.quality.check_points import MARKING_SIGMA_PX
@@ -51,16 +57,15 @@ def read_marked(
         InputError: a file cannot be used, does not state what it must, or a point has no mark in the
             images.
     """
-    if points.frame_sigma_m is None:
-        raise InputError(
-            f"{paths[0].name}: the common error of these points on the Earth is not stated: give it "
-            "with --control-frame-sigma-m HORIZONTAL,UP, e.g. 0.05,0.05 for GNSS"
-        )
     names, files = [], []
     image: list[IntArray] = []
+    unstated: list[InputError] = []
     for path in paths:
-        marks = _control_marks(read_marked_ground(path, points.stated), path)
-        image.append(_images_of(marks, path, scenes, images))
+        read, missing = read_or_missing(read_marked_ground, path, points.stated)
+        marks = _control_marks(read, path)
+        unstated += missing
+        if not missing:
+            image.append(_images_of(marks, path, scenes, images))
         names += [f"{path.name}:{name}" for name in marks.id]
         if points.sigma_m is not None:
             sigma_m = filled_sigmas(marks.sigma_m, points.sigma_m, marks.datum_sigma_m)
@@ -71,7 +76,10 @@ def read_marked(
         for column in ("lon_lat_h", "sigma_m", "line_sample", "sigma_px")
     )
     sigma_m[np.isnan(lon_lat_h[:, 2]), 2] = np.inf
-    _refuse_unknown_sigmas(sigma_m, names)
+    frame_sigma_m = points.frame_sigma_m
+    no_frame = [] if frame_sigma_m is not None else [_no_frame_sigma(paths[0])]
+    refuse_unstated([*_unknown_sigmas(sigma_m, names), *no_frame, *unstated])
+    assert frame_sigma_m is not None
     mark_sigma_px = points.mark_sigma_px or MARKING_SIGMA_PX
     place = np.round(np.nan_to_num(lon_lat_h, nan=-1e6) / _SAME_PLACE).astype(np.int64)
     _, first, point = np.unique(place, axis=0, return_index=True, return_inverse=True)
@@ -87,7 +95,7 @@ def read_marked(
         names=tuple(names[row] for row in first),
         lon_lat_h=lon_lat_h[first],
         sigma_m=sigma_m[first],
-        frame=Frame.from_sigmas(*points.frame_sigma_m),
+        frame=Frame.from_sigmas(*frame_sigma_m),
         marks=observations,
         statements=gathered(chain(*(marks.statements for marks in files))),
     )
@@ -118,7 +126,8 @@ def _images_of(
     """The image (m,) of every mark, by its name, or that of the file where it names none.
 
     Raises:
-        InputError: an image is not among those of the block, or a mark lies outside its image.
+        InputError: an image is not among those of the block, a mark lies outside its image, or latitude
+            and longitude are exchanged.
     """
     of_name: dict[str, set[int]] = {}
     for row, (scene, image) in enumerate(zip(scenes, images, strict=True)):
@@ -139,31 +148,37 @@ def _images_of(
             f"{_some(known)}; give these images, or leave their marks out"
         )
     number = np.array([min(of_name[name]) for name in names.tolist()], dtype=np.int64)
-    size = np.array([scene.image.shape for scene in scenes], dtype=np.float64)[number]
-    outside = (marks.line_sample < -0.5) | (marks.line_sample > size - 0.5)
-    for mark in np.flatnonzero(outside.any(axis=1)).tolist():
-        lines, samples = size[mark]
-        raise InputError(
-            f"{path.name}, point {marks.id[mark]}: line {marks.line_sample[mark, 0]:g}, sample "
-            f"{marks.line_sample[mark, 1]:g} found, outside {names[mark]} with {lines:g} lines of "
-            f"{samples:g} samples; correct the mark or the image it names"
-        )
+    shape = np.array([scene.image.shape for scene in scenes], dtype=np.int64)[number]
+    check_marks_inside(marks.line_sample, marks.id, names, shape, path.name)
+    check_not_exchanged(marks.lon_lat_h, [scenes[row] for row in np.unique(number)], path.name)
     return number
 
 
-def _refuse_unknown_sigmas(sigma_m: Array, names: Sequence[str]) -> None:
+def _no_frame_sigma(path: Path) -> InputError:
+    return InputError(
+        f"{path.name}: the common error of these points on the Earth is not stated: give it "
+        "with --control-frame-sigma-m HORIZONTAL,UP, e.g. 0.05,0.05 for GNSS"
+    )
+
+
+def _unknown_sigmas(sigma_m: Array, names: Sequence[str]) -> list[InputError]:
+    """The error of marks without sigmas of their ground; nothing where all have them."""
     unknown = np.isnan(sigma_m)
-    for row in np.flatnonzero(unknown.any(axis=1)).tolist():
-        axes = [
-            axis
-            for axis, is_unknown in zip(("east", "north", "up"), unknown[row], strict=True)
-            if is_unknown
-        ]
-        raise InputError(
+    if not unknown.any():
+        return []
+    row = int(np.flatnonzero(unknown.any(axis=1))[0])
+    axes = [
+        axis
+        for axis, is_unknown in zip(("east", "north", "up"), unknown[row], strict=True)
+        if is_unknown
+    ]
+    return [
+        InputError(
             f"{int(unknown.any(axis=1).sum())} marks, such as that of {names[row]}, have no sigma "
             f"{', '.join(axes)} of their ground: state it (--control-sigma-m HORIZONTAL,UP); for an ASP "
             "file, state the axes of its sigmas (--control-sigma-axes) where you know them"
         )
+    ]
 
 
 def _refuse_lone_rays(marks: Observations, lon_lat_h: Array, names: Sequence[str]) -> None:

@@ -1,6 +1,7 @@
 """Make a block of the points of another base: read them, give them chips, write the folder."""
 
 import math
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from itertools import chain
@@ -20,15 +21,24 @@ from amers.app.usecases.new_block import (
 )
 from amers.app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
 from amers.services.datums import filled_sigmas
+from amers.services.errors import refuse_unstated
 from amers.services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification
 from amers.services.formats.block.writer import write_block
 from amers.services.formats.gcp.base_chips import open_base_chip, read_base_chips
-from amers.services.formats.gcp.reader import StatedByCaller, read_ground_points
+from amers.services.formats.gcp.reader import (
+    StatedByCaller,
+    ground_points,
+    read_or_missing,
+    read_used_points,
+)
 from amers.services.formats.images.bands import parse_bands
 from amers.services.formats.images.scenes import read_scene
+from amers.services.imagery.marks import check_marks_inside, check_not_exchanged
+from amers.services.imagery.scene import Scene
 from amers.services.production.points_production import (
     KnownPointOptions,
     KnownPoints,
+    check_sigmas,
     produce_known_points,
 )
 from amers.services.production.points_with_chips import OwnChips, produce_points_with_chips
@@ -111,6 +121,7 @@ def run_points_production(
                     read_scene(image, model, sigma_m=files.sigma_m, bands=bands, crop_origin=origin)
                 )
                 stack.callback(scenes[-1].image.close)  # type: ignore[attr-defined]
+            _check_on_scenes(files, scenes)
             production = produce_known_points(ground, scenes, frame, options, make)
             stated = chain(ground.statements, *(scene.statements for scene in scenes))
             production = replace(production, statements=gathered(stated))
@@ -191,19 +202,28 @@ def _metadata(
 
 def _ground_points(files: KnownPointFiles) -> GroundPoints:
     """The points of the file, with heights and sigmas where they are stated elsewhere."""
-    ground = read_ground_points(files.points, files.stated)
+    used, unstated = read_or_missing(read_used_points, files.points, files.stated)
+    ground = ground_points(used)
     sigma_m = ground.sigma_m
+    missing = np.isnan(ground.lon_lat_h[:, 2])
     if files.point_sigma_m is not None:
         sigma_m = filled_sigmas(sigma_m, files.point_sigma_m, ground.datum_sigma_m)
+    of_terrain = missing[:, None] & np.array([False, False, files.terrain is not None])
     ground = replace(ground, sigma_m=sigma_m)
-    missing = np.isnan(ground.lon_lat_h[:, 2])
-    if not missing.any():
-        return ground
-    if files.terrain is None:
-        raise InputError(
-            f"{files.points.name}: {int(missing.sum())} of {len(ground)} points, such as "
-            f"{ground.id[missing][0]}, have no height: give a terrain (--dem FILE)"
+    try:
+        check_sigmas(replace(ground, sigma_m=np.where(of_terrain, 1.0, sigma_m)))
+    except InputError as error:
+        unstated.append(error)
+    if missing.any() and files.terrain is None:
+        unstated.append(
+            InputError(
+                f"{files.points.name}: {int(missing.sum())} of {len(ground)} points, such as "
+                f"{ground.id[missing][0]}, have no height: give a terrain (--dem FILE)"
+            )
         )
+    refuse_unstated(unstated)
+    if not missing.any() or files.terrain is None:
+        return ground
     terrain = read_terrain(files.terrain)
     lon_lat_h = ground.lon_lat_h.copy()
     lon_lat_h[missing, 2] = terrain.height_m(lon_lat_h[missing, :2])
@@ -211,6 +231,17 @@ def _ground_points(files: KnownPointFiles) -> GroundPoints:
     sigma_m[missing, 2] = files.height_sigma_m or HEIGHT_SIGMA_POSTINGS * terrain.posting_m
     statements = ground.statements + terrain.statements
     return replace(ground, lon_lat_h=lon_lat_h, sigma_m=sigma_m, statements=statements)
+
+
+def _check_on_scenes(files: KnownPointFiles, scenes: Sequence[Scene]) -> None:
+    """Refuse marks of the points outside the images, and latitude and longitude exchanged."""
+    marks = read_used_points(files.points, files.stated)
+    check_not_exchanged(marks.lon_lat_h, scenes, files.points.name)
+    for scene, path in zip(scenes, files.images, strict=True):
+        names = [path.name.lower(), path.stem.lower(), scene.acquisition.image_id.lower()]
+        own = marks.take(marks.is_marked & np.isin(np.char.lower(marks.image), names))
+        shape = np.tile(scene.image.shape, (len(own), 1))
+        check_marks_inside(own.line_sample, own.id, own.image, shape, files.points.name)
 
 
 def _or_nan(value: float | None) -> float:

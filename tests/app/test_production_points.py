@@ -121,7 +121,7 @@ def test_a_frame_that_nobody_states_is_unknown(amers, image: Path, tmp_path: Pat
     [
         (("--columns", COLUMNS, "--crs", UTM), "does not state the datum of its heights"),
         (("--columns", COLUMNS, "--vertical", "ellipsoid"), "found none; state it (--crs)"),
-        (("--vertical", "ellipsoid"), "name them (--columns lon=COLUMN,lat=COLUMN)"),
+        (("--vertical", "ellipsoid"), "found none; state it (--crs)"),
         (("--columns", "east=E"), "expected NAME=COLUMN of the file"),
         (("--columns", COLUMNS, "--crs", UTM, "--vertical", "EGM2008"), "pyproj sync --file"),
         (("--columns", COLUMNS, "--crs", UTM, "--vertical", "sea"), "sea given; expected ellipsoid"),

@@ -1,5 +1,6 @@
 """Read the check points of a scene: known ground marked in it, and held out of its registration."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -7,10 +8,14 @@ import numpy as np
 from amers.app.errors import InputError
 from amers.services.formats.gcp.marked_points import MarkedPoints
 from amers.services.formats.gcp.reader import read_control_points
+from amers.services.imagery.marks import check_marks_inside, check_not_exchanged
 from amers.services.imagery.scene import Scene
 from amers.services.quality.check_points import CheckPoints
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.types import Array
+
+_GRID = ", or the grid file of a geoid (--geoid)"
+_OF_HEIGHTS = re.compile(r"--vertical and --geoid|--vertical|--geoid")
 
 
 def read_check_points(path: Path, heights: str | None, image: Path, scene: Scene) -> CheckPoints:
@@ -25,7 +30,7 @@ def read_check_points(path: Path, heights: str | None, image: Path, scene: Scene
     Raises:
         InputError: the file cannot be used, or has no check point of this scene.
     """
-    every = marks_of_scene(path, heights, image)
+    every = marks_of_scene(path, heights, image, scene)
     marks = every.take(every.check if every.check.any() else every.active)
     if len(marks) == 0:
         raise InputError(f"{path.name}: all {len(every)} points are switched off; switch some on")
@@ -33,24 +38,35 @@ def read_check_points(path: Path, heights: str | None, image: Path, scene: Scene
     return CheckPoints(lon_lat_h, marks.line_sample, marks.sigma_m, marks.sigma_px, marks.statements)
 
 
-def marks_of_scene(path: Path, heights: str | None, image: Path) -> MarkedPoints:
+def marks_of_scene(path: Path, heights: str | None, image: Path, scene: Scene) -> MarkedPoints:
     """The marks of a file that are in one image.
 
     Args:
         path: of the file, in any format that `read_control_points` reads.
         heights: vertical datum of its heights, where it states none; see `read_control_points`.
         image: of the scene; a mark that names no image is in it.
+        scene: of the image.
 
     Raises:
-        InputError: the file cannot be used, or has no mark in this image.
+        InputError: the file cannot be used, has no mark in this image, a mark lies outside it, or
+            latitude and longitude are exchanged.
     """
-    marks = read_control_points(path, heights)
+    try:
+        marks = read_control_points(path, heights)
+    except InputError as error:
+        error.args = (_OF_HEIGHTS.sub("--check-heights", str(error).replace(_GRID, "")),)
+        raise
     names = np.char.lower(marks.image)
     is_in_scene = np.isin(names, ["", image.name.lower(), image.stem.lower()])
     if not is_in_scene.any():
         others = ", ".join(sorted(set(marks.image.tolist()))[:3]) or "no image"
         raise InputError(f"{path.name}: expected marks in {image.name}, found marks in {others}")
-    return marks.take(is_in_scene)
+    taken = marks.take(is_in_scene)
+    names_of_image = np.full(len(taken), image.name)
+    shape = np.tile(scene.image.shape, (len(taken), 1))
+    check_marks_inside(taken.line_sample, taken.id, names_of_image, shape, path.name)
+    check_not_exchanged(taken.lon_lat_h, [scene], path.name)
+    return taken
 
 
 def ground_positions(marks: MarkedPoints, path: Path, scene: Scene) -> Array:

@@ -58,7 +58,7 @@ def read_marks(path: Path, heights: str | None, image: Path, scene: Scene) -> Ch
     Raises:
         InputError: the file cannot be used, or has no such mark of this scene.
     """
-    marks = marks_of_scene(path, heights, image)
+    marks = marks_of_scene(path, heights, image, scene)
     used = marks.take(marks.active & ~marks.check)
     if len(used) == 0:
         raise InputError(
