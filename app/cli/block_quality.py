@@ -61,7 +61,7 @@ class HeightOptions(TerrainOptions):
     """Heights that those of a block are compared with.
 
     Attributes:
-        dem: GeoTIFF with heights to compare with.
+        dem: heights to compare with: a file, or a folder or .txt list of tiles.
         vertical: vertical datum of --dem: ellipsoid, EGM96, EGM2008, EPSG:…
         dem_sigma_m: sigma of these heights, metres; by default 0.1 of their step.
         dem_frame_sigma_m: sigma of the error that all of them share, metres.

@@ -31,7 +31,8 @@ class ControlOptions:
         control_ortho: ortho-image that places the block east and north; repeat for several.
         control_ortho_sigma_m: accuracy of --control-ortho on the Earth, one sigma a coordinate, metres;
             by default that of the product.
-        control_dem: GeoTIFF with heights of the ground that places the block in height.
+        control_dem: heights of the ground that places the block in height: a file, or a folder or .txt
+            list of tiles.
         control_dem_vertical: vertical datum of --control-dem: ellipsoid, EGM96, EGM2008, EPSG:…
         control_dem_geoid: grid file of the geoid of --control-dem, GTX or GeoTIFF.
         control_dem_sigma_m: sigma of single heights of --control-dem, metres.

@@ -44,7 +44,7 @@ class StatementOptions:
         columns: columns of a CSV of other names: lon=COLUMN,lat=COLUMN,…
         sigma_axes: axes of the sigmas of an ASP file: ecef or lat-lon-height.
         point_sigma_m: accuracy of points whose file states none: HORIZONTAL,UP, one sigma, metres.
-        dem: GeoTIFF with the heights of points without any.
+        dem: heights of points without any: a file, or a folder or .txt list of tiles.
         dem_vertical: vertical datum of --dem.
         dem_geoid: grid file of the geoid of --dem.
     """

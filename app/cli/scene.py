@@ -39,7 +39,7 @@ class ControlOptions:
     Attributes:
         block: use the points of this block folder instead of the store.
         reference: ortho-image to register on; with --block only where it has no points.
-        dem: GeoTIFF with the heights of the reference's ground.
+        dem: heights of the reference's ground: a file, or a folder or .txt list of tiles.
         vertical: vertical datum of these heights: ellipsoid, EGM96, EPSG:…
         geoid: grid file of the geoid, GTX or GeoTIFF.
         reference_sigma_m: accuracy of the reference on the Earth, one sigma, metres.

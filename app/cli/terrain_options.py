@@ -15,7 +15,7 @@ class TerrainOptions:
     """A terrain, or none.
 
     Attributes:
-        dem: GeoTIFF with the heights of the ground.
+        dem: heights of the ground: GeoTIFF, .hgt, .bil, .asc, VRT …, a folder or .txt list of them.
         vertical: vertical datum of the heights: ellipsoid, EGM96, EGM2008, EPSG:…
         geoid: grid file of the geoid, GTX or GeoTIFF.
     """

@@ -351,7 +351,13 @@ def _run(work: Work) -> Commit:
         with suspecting_damage(work.database, work.storage, files):
             ortho = run_orthorectification(
                 ImageFiles(image, model, None if refined is None else (0.0, 0.0)),
-                TerrainFile(image.with_name(inputs.dem), inputs.vertical, geoid, inputs.fill_px),
+                TerrainFile(
+                    image.with_name(inputs.dem),
+                    inputs.vertical,
+                    geoid,
+                    inputs.fill_px,
+                    is_uploaded=True,
+                ),
                 Path(folder) / ORTHO_NAME,
                 ortho_map=inputs.map,
                 options=inputs.options,

@@ -208,7 +208,7 @@ def _files(work: Work) -> Iterator[tuple[SceneModel, TerrainFile | None]]:
         geoid = image.with_name(inputs.geoid) if inputs.geoid else None
         terrain = None
         if inputs.dem is not None:
-            terrain = TerrainFile(image.with_name(inputs.dem), inputs.vertical, geoid)
+            terrain = TerrainFile(image.with_name(inputs.dem), inputs.vertical, geoid, is_uploaded=True)
         with suspecting_damage(work.database, work.storage, [*stored_keys(scene), *keys]):
             yield SceneModel(image, model, registration), terrain
 

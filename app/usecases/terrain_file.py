@@ -16,11 +16,12 @@ class TerrainFile:
     """A terrain in a file.
 
     Attributes:
-        dem: GeoTIFF with the heights of the ground.
+        dem: file with the heights of the ground, or a folder or list of its tiles; see `read_dem`.
         vertical: vertical datum of the heights: ellipsoid, EGM96, EGM2008, EPSG:…
         geoid: grid file of the geoid, GTX or GeoTIFF.
         fill_px: fill voids of the terrain from this many nodes away.
         geoid_option: what gives `geoid`, for the error when the grid is missing.
+        is_uploaded: the file comes from a stranger: only an image that names no other file is read.
     """
 
     dem: Path
@@ -28,6 +29,7 @@ class TerrainFile:
     geoid: Path | None = None
     fill_px: int = 0
     geoid_option: str = "--geoid"
+    is_uploaded: bool = False
 
 
 def read_terrain(file: TerrainFile) -> Terrain:
@@ -37,6 +39,6 @@ def read_terrain(file: TerrainFile) -> Terrain:
         InputError: the file cannot be used, or the vertical datum is unknown.
     """
     try:
-        return read_dem(file.dem, file.vertical, file.geoid, file.fill_px)
+        return read_dem(file.dem, file.vertical, file.geoid, file.fill_px, images_only=file.is_uploaded)
     except MissingGeoid as error:
         raise MissingGeoid(f"{file.dem}: {error} with {file.geoid_option}") from None

@@ -171,7 +171,13 @@ def _files(work: Work, sigma_m: float | None = None) -> Iterator[_Files]:
             yield _Files(
                 VectorFile(image.with_name(inputs.vectors)),
                 SceneModel(image, model, registration, sigma_m),
-                TerrainFile(image.with_name(inputs.dem), inputs.vertical, geoid, inputs.fill_px),
+                TerrainFile(
+                    image.with_name(inputs.dem),
+                    inputs.vertical,
+                    geoid,
+                    inputs.fill_px,
+                    is_uploaded=True,
+                ),
                 {name: Path(folder) / name for name in names},
             )
 

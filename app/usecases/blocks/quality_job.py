@@ -123,7 +123,7 @@ def _references(folder: Path | None, inputs: AssessBlock) -> QualityReferences:
         geoid = None if inputs.geoid is None else file("geoid", inputs.geoid)
         cover = None if inputs.land_cover is None else file("land_cover", inputs.land_cover)
         heights = HeightFiles(
-            TerrainFile(file("dem", inputs.dem), inputs.vertical, geoid),
+            TerrainFile(file("dem", inputs.dem), inputs.vertical, geoid, is_uploaded=True),
             inputs.dem_sigma_m,
             inputs.dem_frame_sigma_m,
             files("exclude_heights", inputs.exclude_heights),

@@ -236,10 +236,10 @@ def _vertical(stated: _OfFile, caller: HeightsByCaller, source: str) -> tuple[CR
         return stated.vertical, _BY_FILE
     if caller.vertical is not None:
         return requested, _BY_CALLER
-    if caller.geoid is not None:
-        return None, _BY_GRID
     if caller.by_format is not None:
         return vertical_crs(caller.by_format), _BY_FORMAT
+    if caller.geoid is not None:
+        return None, _BY_GRID
     raise VerticalDatumError(
         f"{source}: the file does not state its vertical datum: give ellipsoid, EGM96, EGM2008 or the "
         "code of a vertical reference system (--vertical), or the grid file of a geoid (--geoid)"

@@ -227,7 +227,7 @@ def open_raster(path: FilePlace, bands: int | BandMix | None = 1) -> RasterImage
             if bands is None:
                 bands = default_mix(validity.colours, path)
             mix = bands if isinstance(bands, BandMix) else one_band(bands)
-            _check_declaration(path, dataset, mix)
+            check_declaration(path, dataset, mix)
             palette, statements = _palette(path, dataset, mix, validity)
             image = RasterImage(path, dataset, open_pixels(path, dataset), mix, validity, palette)
             statements += (*validity.statements, *_other_pages(path, dataset))
@@ -407,8 +407,12 @@ def gdal_rpc(model: RpcModel) -> rasterio.rpc.RPC:
     )
 
 
-def _check_declaration(path: FilePlace, dataset: rasterio.DatasetReader, mix: BandMix) -> None:
-    """Refuse impossible sizes and bands before memory is allocated for them."""
+def check_declaration(path: FilePlace, dataset: rasterio.DatasetReader, mix: BandMix) -> None:
+    """Refuse impossible sizes and bands before memory is allocated for them.
+
+    Raises:
+        FormatError: the file declares what it cannot contain.
+    """
     for band in mix.bands:
         if not 1 <= band <= dataset.count:
             raise FormatError(f"{path}: band {band} requested, the image has {dataset.count} bands")

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from rasterio.transform import from_origin
 
 from amers.services.errors import CoverageError, FormatError, VerticalDatumError
-from amers.services.formats.elevation.dem import FilledVoids, read_dem
+from amers.services.formats.elevation.dem import read_dem
+from amers.services.formats.elevation.filled_voids import FilledVoids
 from amers.services.formats.elevation.geoid import geoid_of_grid
 from amers.services.imagery.source import ArrayImage, Window
 from amers.services.terrain import Terrain
