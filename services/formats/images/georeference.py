@@ -15,8 +15,64 @@ from rasterio.transform import Affine
 
 from amers.services.errors import FormatError
 from amers.services.formats.addresses import FilePlace
+from amers.services.formats.reader_rows import Reader, Treatment
 from amers.services.formats.text_files import parse_number, parse_xml, read_text
 from amers.services.statements import Statement, Statements, Subject, Use
+
+AUX_READER = Reader(
+    "`.aux.xml` of GDAL and QGIS",
+    (),
+    (
+        Treatment(
+            Subject.MODEL,
+            "used",
+            "The domain RPC, in GDAL's order after the tags of a GeoTIFF.",
+        ),
+        Treatment(Subject.MODEL, "refused", "A number of the RPC that is missing."),
+        Treatment(Subject.PLACE, "used", "GeoTransform, before that of the image itself."),
+        Treatment(Subject.PLACE, "refused", "A GeoTransform that is not six numbers."),
+        Treatment(Subject.HORIZONTAL_DATUM, "used", "SRS, before that of the image itself."),
+        Treatment(Subject.HORIZONTAL_DATUM, "refused", "A SRS that is not WKT."),
+    ),
+    never=(
+        Subject.PIXEL_ORIGIN,
+        Subject.VERTICAL_DATUM,
+        Subject.UNIT,
+        Subject.EPOCH,
+        Subject.ORDER,
+        Subject.VALIDITY,
+        Subject.BANDS,
+        Subject.IDENTITY,
+        Subject.ACCURACY,
+    ),
+)
+WORLD_FILE_READER = Reader(
+    "World files (`.tfw`, `.j2w`, `.wld`) with `.prj`",
+    (),
+    (
+        Treatment(
+            Subject.PLACE, "used", "Where neither the image nor its `.aux.xml` has a geotransform."
+        ),
+        Treatment(Subject.PLACE, "named", "A geotransform that differs from that of the image."),
+        Treatment(Subject.PLACE, "refused", "A file that is not six numbers."),
+        Treatment(Subject.HORIZONTAL_DATUM, "used", "The `.prj`, where nothing else states a system."),
+        Treatment(
+            Subject.HORIZONTAL_DATUM, "refused", "None in a `.prj` either, or one that is not WKT."
+        ),
+    ),
+    never=(
+        Subject.MODEL,
+        Subject.PIXEL_ORIGIN,
+        Subject.VERTICAL_DATUM,
+        Subject.UNIT,
+        Subject.EPOCH,
+        Subject.ORDER,
+        Subject.VALIDITY,
+        Subject.BANDS,
+        Subject.IDENTITY,
+        Subject.ACCURACY,
+    ),
+)
 
 SAME_PX = 0.01
 """Geotransforms that differ by less in the image are the same."""

@@ -17,6 +17,7 @@ from amers.services.formats.images.masks import MaskedImage, apply_mask
 from amers.services.formats.images.raster import map_grid_of, shift_of_grid
 from amers.services.formats.images.siblings import Siblings
 from amers.services.formats.images.tiled_image import SceneImage, TiledImage
+from amers.services.formats.reader_rows import Reader, Treatment
 from amers.services.formats.sensor_models.dimap import (
     parse_dimap_acquisition,
     parse_dimap_pixel_codes,
@@ -36,6 +37,34 @@ from amers.services.sensors.parameter_sets import ParameterSet
 from amers.services.sensors.rpc import RpcModel
 from amers.services.statements import Statement, Statements, Subject, Use
 from amers.services.types import Acquisition, Array
+
+READER = Reader(
+    "Scenes: RPC and place in GeoTIFF, JPEG 2000 and NITF",
+    ("read_scene",),
+    (
+        Treatment(Subject.MODEL, "used", "The first of GDAL's order: files of vendors, tags, others."),
+        Treatment(Subject.MODEL, "named", "Any other model that differs by 0.01 px or more."),
+        Treatment(Subject.MODEL, "refused", "No model, or ground control points in its place."),
+        Treatment(Subject.PLACE, "used", "ICHIPB of a NITF; the geotransform of a crop or a reduction."),
+        Treatment(Subject.PLACE, "assumed", "A tile by its name, whose model has the tile's own name."),
+        Treatment(Subject.PLACE, "named", "A map grid of an image with a sensor model."),
+        Treatment(Subject.PLACE, "refused", "A crop whose RPC may be of the crop or of the full image."),
+        Treatment(Subject.ACCURACY, "used", "ERR_BIAS and ERR_RAND of tags and RPC00B."),
+        Treatment(Subject.ACCURACY, "named", "The same, where --sigma-m states another."),
+        Treatment(Subject.ACCURACY, "assumed", "That of the sensor, else 50 m."),
+        Treatment(Subject.IDENTITY, "used", "MISSION, IMAGING_DATE of tags, IDATIM of a NITF."),
+        Treatment(Subject.HORIZONTAL_DATUM, "used", "The system of an ortho-image."),
+    ),
+    never=(
+        Subject.PIXEL_ORIGIN,
+        Subject.VERTICAL_DATUM,
+        Subject.UNIT,
+        Subject.EPOCH,
+        Subject.ORDER,
+        Subject.VALIDITY,
+        Subject.BANDS,
+    ),
+)
 
 CE90_TO_SIGMA = 1.0 / math.sqrt(2.0 * math.log(10.0))
 """Ratio of one standard deviation of each coordinate to CE90, for a circular normal law: 1 / 2.1460."""
@@ -130,9 +159,14 @@ def read_scene(
     except FormatError:
         image.close()
         raise
-    if sigma_m is None:
-        sigma_m = prior_sigma_m(delivered.model, acquisition.sensor)
-    statements = (*source.statements, *delivered.statements, *_unused_grid(image, delivered))
+    sigma_m, accuracy = _accuracy(delivered, acquisition.sensor, sigma_m)
+    statements = (
+        *source.statements,
+        *delivered.statements,
+        *_unused_grid(image, delivered),
+        *_identity(acquisition, delivered),
+        *accuracy,
+    )
     if rigorous is None:
         return Scene(source, delivered.model, acquisition, sigma_m, statements=statements)
     model = rigorous.model
@@ -180,6 +214,33 @@ def _ortho_scene(image: SceneImage, grid: MapGrid, sigma_m: float | None, mask: 
         math.hypot(sigma_m, shift.sigma_m),
         statements=(*source.statements, *stated, shift.statement(image.path.name)),
     )
+
+
+def _accuracy(delivered: DeliveredModel, sensor: str, sigma_m: float | None) -> tuple[float, Statements]:
+    """The accuracy of a model, and what its file and its sensor state of it."""
+    name, model = delivered.path.name, delivered.model
+    stated_m = model.error_bias_m
+    if sigma_m is not None:
+        if not stated_m > 0.0 or sigma_m == stated_m:
+            return sigma_m, ()
+        value, note = f"bias {stated_m:g} m", f"{sigma_m:g} m was given"
+        return sigma_m, (Statement(name, Subject.ACCURACY, Use.NOT_USED, value, note=note),)
+    prior_m = prior_sigma_m(model, sensor)
+    if stated_m > 0.0:
+        return prior_m, (Statement(name, Subject.ACCURACY, Use.USED, f"{prior_m:.2f} m, one sigma"),)
+    known = any(sensor.startswith(start) for start, _ in CE90_M)
+    note = (f"that of {sensor}" if known else "the sensor is unknown") + "; --sigma-m states another"
+    value = f"{prior_m:.2f} m, one sigma"
+    return prior_m, (Statement(name, Subject.ACCURACY, Use.ASSUMED, value, note=note),)
+
+
+def _identity(acquisition: Acquisition, delivered: DeliveredModel) -> Statements:
+    """The sensor and the time that the files of an image state."""
+    words = [acquisition.sensor]
+    if acquisition.acquired_at is not None:
+        words.append(f"{acquisition.acquired_at:%Y-%m-%d %H:%M:%S} UTC")
+    value = ", ".join(word for word in words if word)
+    return (Statement(delivered.path.name, Subject.IDENTITY, Use.USED, value),) if value else ()
 
 
 def _unused_grid(image: SceneImage, delivered: DeliveredModel) -> Statements:
@@ -360,8 +421,11 @@ def _product_name(path: FilePlace) -> str:
 def _dimap_acquisition(path: FilePlace, image_id: str) -> Acquisition:
     """The acquisition in the DIMAP document of the product, where it exists, else in that of the RPC."""
     product = path.with_name(_product_name(path))
-    source = product if product.is_file() else path
-    return parse_dimap_acquisition(read_text(source), image_id, source.name)
+    of_rpc = parse_dimap_acquisition(read_text(path), image_id, path.name)
+    if not product.is_file():
+        return of_rpc
+    stated = parse_dimap_acquisition(read_text(product), image_id, product.name)
+    return stated if stated.sensor else replace(stated, sensor=of_rpc.sensor)
 
 
 def _central_view(model: RpcModel, shape: tuple[int, int]) -> tuple[float, float]:

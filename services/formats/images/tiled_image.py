@@ -131,4 +131,5 @@ def open_tiles(
             image.close()
         raise
     statements = gathered(one for image in images for one in image.statements)
-    return TiledImage(path, shape, tuple(images), tuple(first for _, first, _ in tiles), statements)
+    places = tuple(first for _, first, _ in tiles)
+    return TiledImage(path, shape, tuple(images), places, statements)

@@ -15,12 +15,47 @@ import numpy as np
 
 from amers.services.errors import FormatError
 from amers.services.formats.images.bands import PixelCodes
+from amers.services.formats.reader_rows import Reader, Treatment
 from amers.services.formats.sensor_models.rpc_text import rpc_from_numbers
 from amers.services.formats.sensor_models.xml_values import single
 from amers.services.formats.text_files import parse_number, parse_xml
 from amers.services.sensors.rpc import RpcModel
 from amers.services.sensors.rpc_fit import fit_to_ground
+from amers.services.statements import Subject
 from amers.services.types import Acquisition, Array
+
+READER = Reader(
+    "RPC of DIMAP (`RPC_….XML`, with `DIM_….XML`)",
+    ("parse_dimap_rpc", "parse_dimap_acquisition", "parse_dimap_pixel_codes"),
+    (
+        Treatment(
+            Subject.MODEL, "used", "Inverse_Model of version 2, GroundtoImage_Values of version 3."
+        ),
+        Treatment(Subject.MODEL, "refused", "Another version, or a number that is missing."),
+        Treatment(Subject.PIXEL_ORIGIN, "used", "From (1, 1) in version 2, as the domain states in 3."),
+        Treatment(Subject.PLACE, "used", "The tile that `DIM_….XML` lists, or `_R2C1` in a name."),
+        Treatment(
+            Subject.PLACE, "refused", "A tile without `DIM_….XML`, or of another size than it states."
+        ),
+        Treatment(
+            Subject.PLACE,
+            "assumed",
+            "An image of another size than the domain begins at its first pixel.",
+        ),
+        Treatment(Subject.VALIDITY, "used", "Special values NODATA and SATURATED of `DIM_….XML`."),
+        Treatment(Subject.ACCURACY, "named", "Errors of the fit of the polynomials."),
+        Treatment(Subject.ACCURACY, "assumed", "That of the sensor."),
+        Treatment(Subject.IDENTITY, "used", "Mission, time and sun of `DIM_….XML`."),
+    ),
+    never=(
+        Subject.HORIZONTAL_DATUM,
+        Subject.VERTICAL_DATUM,
+        Subject.UNIT,
+        Subject.EPOCH,
+        Subject.ORDER,
+        Subject.BANDS,
+    ),
+)
 
 _PROFILES = {"PHR": "PHR", "S6": "SPOT6", "S7": "SPOT7", "PNEO": "PNEO"}
 _FOLD_TOLERANCE_PX = 1e-7
@@ -47,8 +82,7 @@ def parse_dimap_rpc(text: str, source: str = "DIMAP") -> RpcModel:
         FormatError: it is not such a document, or a number is missing or given twice.
     """
     root = parse_xml(text, source)
-    values, domain, first = _layout(root, source)
-    model = single(root, values, source)
+    model = single(root, _layout(root, source)[0], source)
     validity = single(root, "RFM_Validity", source)
 
     def number(key: str) -> float:
@@ -57,6 +91,16 @@ def parse_dimap_rpc(text: str, source: str = "DIMAP") -> RpcModel:
         parent = model if "COEFF" in key else validity
         return parse_number(single(parent, key, source).text or "", key, source)
 
+    return rpc_from_numbers(number, dimap_first_pixel(root, source))
+
+
+def dimap_first_pixel(root: ElementTree.Element, source: str) -> tuple[float, float]:
+    """Line and sample of the first pixel in the convention of a DIMAP document.
+
+    Raises:
+        FormatError: it is not a document of version 2 or 3, or its validity domain has no number.
+    """
+    _, domain, first = _layout(root, source)
     if domain is not None:
         first_texts = [
             single(single(root, domain, source), name, source).text or ""
@@ -64,7 +108,7 @@ def parse_dimap_rpc(text: str, source: str = "DIMAP") -> RpcModel:
         ]
         first_row, first_col = (parse_number(text, domain, source) for text in first_texts)
         first = (float(first_row == 1.0), float(first_col == 1.0))
-    return rpc_from_numbers(number, first)
+    return first
 
 
 def format_dimap_rpc(text: str, model: RpcModel, source: str = "DIMAP") -> str:

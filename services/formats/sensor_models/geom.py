@@ -10,6 +10,7 @@ import re
 from collections.abc import Mapping
 
 from amers.services.errors import FormatError
+from amers.services.formats.reader_rows import Reader, Treatment
 from amers.services.formats.sensor_models.dimap import parse_imaging_time
 from amers.services.formats.sensor_models.rpc_text import (
     RPC00A_ORDER,
@@ -19,7 +20,35 @@ from amers.services.formats.sensor_models.rpc_text import (
 )
 from amers.services.formats.text_files import parse_number
 from amers.services.sensors.rpc import RpcModel
+from amers.services.statements import Subject
 from amers.services.types import Acquisition
+
+READER = Reader(
+    "OSSIM and OTB `.geom`",
+    ("parse_geom", "parse_geom_acquisition"),
+    (
+        Treatment(Subject.MODEL, "used", "The RPC, with its current adjustment applied."),
+        Treatment(Subject.MODEL, "refused", "An adjustment that an RPC cannot express, or no RPC."),
+        Treatment(Subject.PIXEL_ORIGIN, "used", "Half pixels that the loaders of two sensors lose."),
+        Treatment(Subject.ORDER, "refused", "A polynomial_format other than A and B, which are used."),
+        Treatment(
+            Subject.PLACE,
+            "used",
+            "The geotransform of an OTB crop, where the range of the RPC "
+            "decides whether it is of the full image.",
+        ),
+        Treatment(Subject.ACCURACY, "used", "bias_error and rand_error, where they are positive."),
+        Treatment(Subject.IDENTITY, "used", "sensor, image_date and the angles of the sun."),
+    ),
+    never=(
+        Subject.HORIZONTAL_DATUM,
+        Subject.VERTICAL_DATUM,
+        Subject.UNIT,
+        Subject.EPOCH,
+        Subject.VALIDITY,
+        Subject.BANDS,
+    ),
+)
 
 _KEYS = {
     "ERR_BIAS": "bias_error",

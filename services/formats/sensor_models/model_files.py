@@ -10,7 +10,7 @@ import rasterio
 
 from amers.services.errors import FormatError
 from amers.services.formats.addresses import FilePlace
-from amers.services.formats.sensor_models.dimap import parse_dimap_rpc
+from amers.services.formats.sensor_models.dimap import dimap_first_pixel, parse_dimap_rpc
 from amers.services.formats.sensor_models.geom import is_geom, parse_geom
 from amers.services.formats.sensor_models.rigorous_model import rpc_of_rigorous_model
 from amers.services.formats.sensor_models.rpc_text import (
@@ -25,6 +25,7 @@ from amers.services.formats.sensor_models.rpc_text import (
 from amers.services.formats.sensor_models.xml_values import single
 from amers.services.formats.text_files import parse_number, parse_xml, read_text
 from amers.services.sensors.rpc import RpcModel
+from amers.services.statements import Statement, Statements, Subject, Use
 
 Convention = Literal["tags", "text", "rpb", "isd", "dimap", "geom", "aux", "rigorous"]
 
@@ -38,12 +39,16 @@ class FoundModel:
         path: of the file.
         convention: its format.
         mended: what was changed in it; "" where nothing was.
+        shape: lines and samples of the image that it is for, where its file states them.
+        statements: of its file, beyond the model itself.
     """
 
     model: RpcModel
     path: FilePlace
     convention: Convention
     mended: str = ""
+    shape: tuple[int, int] | None = None
+    statements: Statements = ()
 
     @property
     def name(self) -> str:
@@ -61,10 +66,13 @@ def read_model_file(path: FilePlace) -> FoundModel:
     if text.lstrip("\ufeff \t\r\n").startswith("<"):
         return _read_xml(text, path)
     if re.search(r"\bBEGIN_GROUP\b", text):
-        return FoundModel(parse_rpb(text, path.name), path, "rpb")
+        return FoundModel(
+            parse_rpb(text, path.name), path, "rpb", statements=_rpb_statements(text, path)
+        )
     if is_geom(text):
         model, mended = parse_geom(text, path.name)
-        return FoundModel(model, path, "geom", mended)
+        origin = Statement(path.name, Subject.PIXEL_ORIGIN, Use.USED, mended)
+        return FoundModel(model, path, "geom", mended, statements=(origin,) if mended else ())
     return FoundModel(parse_rpc_text(text, path.name), path, "text")
 
 
@@ -135,12 +143,42 @@ def _read_xml(text: str, path: FilePlace) -> FoundModel:
         tags = {item.get("key", ""): item.text or "" for item in domain.iter("MDI")}
         return FoundModel(_parse_tags(tags, path.name), path, "aux")
     if root.tag == "isd" and root.find("RPB") is not None:
-        return FoundModel(_parse_isd_rpb(root, path.name), path, "isd")
+        shape = _shape(root, "IMD/NUMROWS", "IMD/NUMCOLUMNS")
+        return FoundModel(_parse_isd_rpb(root, path.name), path, "isd", shape=shape)
     fit = rpc_of_rigorous_model(text, path.name)
     if fit is not None:
         note = f"RPC fitted to it within {fit.max_error_px:.2g} px"
         return FoundModel(fit.model, path, "rigorous", note)
-    return FoundModel(parse_dimap_rpc(text, path.name), path, "dimap")
+    last = _shape(root, ".//RFM_Validity//LAST_ROW", ".//RFM_Validity//LAST_COL")
+    first = dimap_first_pixel(root, path.name)
+    shape = None if last is None else (last[0] + 1 - int(first[0]), last[1] + 1 - int(first[1]))
+    model = parse_dimap_rpc(text, path.name)
+    stated = [
+        Statement(path.name, Subject.PIXEL_ORIGIN, Use.USED, f"first pixel ({first[0]:g}, {first[1]:g})")
+    ]
+    error = root.find(".//ERR_BIAS_ROW")
+    error = root.find(".//ERR_BIAS_X") if error is None else error
+    if error is not None:
+        note = "of the fit of the polynomials, not of the scene"
+        value = f"{error.tag} {(error.text or '').strip()[:20]}"
+        stated.append(Statement(path.name, Subject.ACCURACY, Use.NOT_USED, value, note=note))
+    return FoundModel(model, path, "dimap", shape=shape, statements=tuple(stated))
+
+
+def _shape(root: ElementTree.Element, rows: str, columns: str) -> tuple[int, int] | None:
+    """Two whole numbers of a document; None where one is missing."""
+    texts = [(root.findtext(path) or "").strip() for path in (rows, columns)]
+    numbers = [int(float(text)) for text in texts if re.fullmatch(r"\d{1,9}(\.0*)?", text)]
+    return (numbers[0], numbers[1]) if len(numbers) == 2 else None
+
+
+def _rpb_statements(text: str, path: FilePlace) -> Statements:
+    """For which band the RPC of a RPB is: all bands of an image take it."""
+    band = re.search(r"\bbandId\s*=\s*\"?(\w+)", text, re.IGNORECASE)
+    if band is None:
+        return ()
+    note = "all bands of the image have this model"
+    return (Statement(path.name, Subject.BANDS, Use.NOT_USED, f"bandId {band[1]}", note=note),)
 
 
 def _rpc_domain(root: ElementTree.Element) -> ElementTree.Element | None:

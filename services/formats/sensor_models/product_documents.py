@@ -12,8 +12,40 @@ from xml.etree import ElementTree
 from amers.services.errors import FormatError
 from amers.services.formats.addresses import FilePlace
 from amers.services.formats.images.siblings import Siblings
+from amers.services.formats.reader_rows import Reader, Treatment
 from amers.services.formats.sensor_models.xml_values import single, whole_number
 from amers.services.formats.text_files import parse_xml, read_text
+from amers.services.statements import Subject
+
+READER = Reader(
+    "Documents of products in tiles (`DIM_….XML`, `METADATA.DIM`, `.TIL`)",
+    ("read_product",),
+    (
+        Treatment(
+            Subject.PLACE,
+            "used",
+            "Regular_Tiling, or the offsets of a `.TIL`: a tile has its place, all tiles are one image.",
+        ),
+        Treatment(Subject.PLACE, "refused", "Tiles that are missing, overlap or have another size."),
+        Treatment(Subject.UNIT, "refused", "tileUnits that are not Pixels."),
+        Treatment(Subject.MODEL, "used", "The RPC of the whole image."),
+        Treatment(
+            Subject.BANDS,
+            "named",
+            "A second image of the product, such as NED of Pléiades Neo.",
+        ),
+        Treatment(Subject.IDENTITY, "used", "The sensor of the product."),
+    ),
+    never=(
+        Subject.PIXEL_ORIGIN,
+        Subject.HORIZONTAL_DATUM,
+        Subject.VERTICAL_DATUM,
+        Subject.EPOCH,
+        Subject.ORDER,
+        Subject.VALIDITY,
+        Subject.ACCURACY,
+    ),
+)
 
 _TILE = re.compile(r"_R(\d{1,4})C(\d{1,4})(?=[_-]|$)", re.IGNORECASE)
 _PNEO_BANDS = re.compile(r"_(?:P|RGB|NED)$", re.IGNORECASE)
@@ -32,6 +64,7 @@ class ProductTile:
         first: line and sample of its first pixel in the whole image.
         shape: its lines and samples.
         product_shape: those of the whole image.
+        others: names of other images that the document lists.
     """
 
     document: FilePlace
@@ -39,6 +72,7 @@ class ProductTile:
     first: tuple[int, int]
     shape: tuple[int, int]
     product_shape: tuple[int, int]
+    others: tuple[str, ...] = ()
 
 
 def is_document(path: FilePlace) -> bool:
@@ -125,10 +159,10 @@ def _dimap_tiles(root: ElementTree.Element, path: FilePlace) -> list[ProductTile
         whole_number(root, "Raster_Dimensions/NROWS", source, (1, _MAX_SIZE)),
         whole_number(root, "Raster_Dimensions/NCOLS", source, (1, _MAX_SIZE)),
     )
-    files = _image_files(root, source)
+    files, others = _image_files(root, source)
     tiling = root.find(".//Regular_Tiling")
     if len(files) == 1:
-        return [ProductTile(path, files[0][0], (0, 0), shape, shape)]
+        return [ProductTile(path, files[0][0], (0, 0), shape, shape, others)]
     if tiling is None:
         raise FormatError(
             f"{source}: {len(files)} files and no Regular_Tiling found, their places expected"
@@ -149,12 +183,14 @@ def _dimap_tiles(root: ElementTree.Element, path: FilePlace) -> list[ProductTile
             raise FormatError(
                 f"{source}: the tile {name[:200]} begins beyond the {shape} pixels of the image"
             )
-        tiles.append(ProductTile(path, name, first, (size_px[0], size_px[1]), shape))
+        tiles.append(ProductTile(path, name, first, (size_px[0], size_px[1]), shape, others))
     return sorted(tiles, key=lambda tile: tile.first)
 
 
-def _image_files(root: ElementTree.Element, source: str) -> list[tuple[str, int, int]]:
-    """Name, row and column of the files of one image."""
+def _image_files(
+    root: ElementTree.Element, source: str
+) -> tuple[list[tuple[str, int, int]], tuple[str, ...]]:
+    """Name, row and column of the files of one image, and the names of the other images."""
     groups: dict[str, list[tuple[str, int, int]]] = {}
     for entry in root.iter("Data_File"):
         name = single(entry, "DATA_FILE_PATH", source).get("href", "")
@@ -168,12 +204,13 @@ def _image_files(root: ElementTree.Element, source: str) -> list[tuple[str, int,
     if not groups:
         raise FormatError(f"{source}: no Data_File found, the files of the image expected")
     visible = [stem for stem in groups if not stem.upper().endswith("_NED")]
-    files = groups[(visible or list(groups))[0]]
+    chosen = (visible or list(groups))[0]
+    files = groups[chosen]
     if len({(row, column) for _, row, column in files}) < len(files):
         raise FormatError(
             f"{source}: two files have the same tile_R and tile_C, each place once expected"
         )
-    return files
+    return files, tuple(stem for stem in groups if stem != chosen)
 
 
 def _til_tiles(text: str, path: FilePlace) -> list[ProductTile]:

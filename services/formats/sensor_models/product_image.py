@@ -1,5 +1,6 @@
 """The image that a path stands for: an image file, a product in tiles by its document, or a folder."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from amers.services.errors import FormatError
@@ -14,6 +15,7 @@ from amers.services.formats.sensor_models.product_documents import (
     read_product,
 )
 from amers.services.formats.text_files import read_text
+from amers.services.statements import Statement, Subject, Use
 
 IMAGE_SUFFIXES = (".tif", ".tiff", ".jp2", ".j2k", ".ntf", ".nitf", ".nsf")
 
@@ -45,10 +47,17 @@ def open_image(path: FilePlace, bands: int | BandMix | None = 1) -> SceneImage:
             f"{path}: of its {len(tiles)} tiles {len(missing)} not found: {', '.join(missing[:5])}; put "
             f"them beside {path.name}, or give the tiles that are there: each keeps its place"
         )
+    note = "give one of its files"
+    others = tuple(
+        Statement(path.name, Subject.BANDS, Use.NOT_USED, f"the image {other}", note=note)
+        for other in tiles[0].others
+    )
     if len(tiles) == 1:
-        return open_raster(files[0], bands)
+        image = open_raster(files[0], bands)
+        return replace(image, statements=(*image.statements, *others))
     parts = [(file, tile.first, tile.shape) for file, tile in zip(files, tiles, strict=True)]
-    return open_tiles(path, tiles[0].product_shape, parts, bands)
+    tiled = open_tiles(path, tiles[0].product_shape, parts, bands)
+    return replace(tiled, statements=(*tiled.statements, *others))
 
 
 def tile_file(tile: ProductTile) -> FilePlace:

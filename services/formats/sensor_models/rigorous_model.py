@@ -5,6 +5,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from amers.services.errors import FormatError
+from amers.services.formats.reader_rows import Reader, Treatment
 from amers.services.formats.sensor_models.dimap_rigorous import parse_dimap_rigorous
 from amers.services.formats.sensor_models.phr_dimap import parse_phr_dimap
 from amers.services.formats.sensor_models.spot_dimap import parse_spot_dimap
@@ -12,6 +13,35 @@ from amers.services.formats.sensor_models.worldview_isd import parse_worldview_i
 from amers.services.formats.text_files import parse_xml, read_text
 from amers.services.sensors.pushbroom import PushbroomModel
 from amers.services.sensors.rpc_fit import RpcFit, fit_rpc
+from amers.services.statements import Subject
+
+READER = Reader(
+    "Orbit and attitude (PHRDIMAP, DIMAP 1 and 2)",
+    ("parse_phr_dimap", "parse_spot_dimap", "parse_dimap_rigorous", "read_rigorous_model"),
+    (
+        Treatment(
+            Subject.MODEL,
+            "used",
+            "Where there is no RPC an RPC is fitted to it; with --rigorous itself.",
+        ),
+        Treatment(Subject.MODEL, "refused", "A value that is missing, impossible or not supported."),
+        Treatment(
+            Subject.IDENTITY, "used", "The name of the product, where all images are called IMAGERY."
+        ),
+        Treatment(Subject.ACCURACY, "assumed", "That of the sensor, else 50 m."),
+    ),
+    never=(
+        Subject.PLACE,
+        Subject.PIXEL_ORIGIN,
+        Subject.HORIZONTAL_DATUM,
+        Subject.VERTICAL_DATUM,
+        Subject.UNIT,
+        Subject.EPOCH,
+        Subject.ORDER,
+        Subject.VALIDITY,
+        Subject.BANDS,
+    ),
+)
 
 _READERS: dict[tuple[str, str], Callable[[str, str], PushbroomModel]] = {
     ("PHR_Dimap_Document", ""): parse_phr_dimap,

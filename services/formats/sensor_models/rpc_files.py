@@ -258,7 +258,8 @@ def _delivered(
     )
     used = model_statements(found, model, [], image.shape)
     origin = (0.0, 0.0) if place is None else place.first
-    return DeliveredModel(model, found, origin, note, (*used, *stated), place)
+    statements = (*used, *found.statements, *stated)
+    return DeliveredModel(model, found, origin, note, statements, place)
 
 
 def _place_of(
@@ -295,7 +296,15 @@ def _without_place(found: FoundModel, image: RasterImage) -> list[Statement]:
     """What is assumed, or refused, of a tile whose place nothing states."""
     tile = without_tile(image.path.stem) != image.path.stem and "_R1C1" not in image.path.stem.upper()
     if not tile:
-        return []
+        if found.shape in (None, image.shape):
+            return []
+        size = f"{found.shape[0]} x {found.shape[1]}" if found.shape else ""
+        note = (
+            f"{found.name} is for {size} pixels, the image has {image.shape[0]} x {image.shape[1]}: "
+            "taken from the first pixel on; --crop-origin LINE,SAMPLE states another place"
+        )
+        value = "line 0, sample 0"
+        return [Statement(image.path.name, Subject.PLACE, Use.ASSUMED, value, note=note)]
     name = image.path.name
     of_whole = found.convention in ("dimap", "rigorous") or (
         found.convention in ("rpb", "isd") and without_tile(found.path.stem) == found.path.stem

@@ -11,9 +11,61 @@ from collections.abc import Callable
 import numpy as np
 
 from amers.services.errors import FormatError
+from amers.services.formats.reader_rows import Reader, Treatment
 from amers.services.formats.text_files import NUMBER_PATTERN, parse_number
 from amers.services.sensors.rpc import RpcModel
+from amers.services.statements import Subject
 from amers.services.types import Array
+
+RPC_TEXT_READER = Reader(
+    "RPC as text (`_RPC.TXT`, `.rpc`)",
+    ("parse_rpc_text",),
+    (
+        Treatment(Subject.MODEL, "used", "`KEY: number` or `KEY=number` on each line, in any order."),
+        Treatment(Subject.MODEL, "refused", "A key that is missing, given twice, or not a number."),
+        Treatment(
+            Subject.UNIT, "refused", "Units other than pixels, degrees and metres after a number."
+        ),
+        Treatment(Subject.ACCURACY, "used", "ERR_BIAS and ERR_RAND, metres, where they are positive."),
+        Treatment(Subject.ACCURACY, "assumed", "That of the sensor, else 50 m."),
+        Treatment(
+            Subject.IDENTITY, "refused", "A line that is no number, such as the name of a satellite."
+        ),
+    ),
+    never=(
+        Subject.PLACE,
+        Subject.PIXEL_ORIGIN,
+        Subject.HORIZONTAL_DATUM,
+        Subject.VERTICAL_DATUM,
+        Subject.EPOCH,
+        Subject.ORDER,
+        Subject.VALIDITY,
+        Subject.BANDS,
+    ),
+)
+RPB_READER = Reader(
+    "DigitalGlobe `.RPB`",
+    ("parse_rpb",),
+    (
+        Treatment(Subject.MODEL, "used", "The fields of the group IMAGE."),
+        Treatment(Subject.PLACE, "used", "The `.TIL` of the product places a tile in its image."),
+        Treatment(
+            Subject.PLACE, "assumed", "A tile without a `.TIL` is taken to have a RPB of its own."
+        ),
+        Treatment(Subject.ORDER, "refused", "A SpecId that is not RPC00B."),
+        Treatment(Subject.ACCURACY, "used", "errBias and errRand, metres, where they are positive."),
+        Treatment(Subject.IDENTITY, "used", "satId, and the time of the first line in the `.IMD`."),
+        Treatment(Subject.BANDS, "named", "bandId: all bands of the image take the model."),
+    ),
+    never=(
+        Subject.PIXEL_ORIGIN,
+        Subject.HORIZONTAL_DATUM,
+        Subject.VERTICAL_DATUM,
+        Subject.UNIT,
+        Subject.EPOCH,
+        Subject.VALIDITY,
+    ),
+)
 
 Numbers = Callable[[str], float]
 """Returns the number of a key in the names of GDAL, such as `LINE_OFF` or `SAMP_DEN_COEFF_20`."""

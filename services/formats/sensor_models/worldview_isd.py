@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from amers.services.errors import FormatError
+from amers.services.formats.reader_rows import Reader, Treatment
 from amers.services.formats.sensor_models.dimap import parse_imaging_time
 from amers.services.formats.sensor_models.xml_values import (
     check_increasing,
@@ -29,7 +30,38 @@ from amers.services.sensors.pushbroom import (
     check_pushbroom,
     used_times,
 )
+from amers.services.statements import Subject
 from amers.services.types import Acquisition, Array
+
+READER = Reader(
+    "XML of WorldView products (ISD)",
+    ("parse_worldview_isd", "parse_isd_acquisition"),
+    (
+        Treatment(
+            Subject.MODEL, "used", "The block RPB; without one an RPC fitted to orbit and attitude."
+        ),
+        Treatment(Subject.MODEL, "refused", "A value that is missing or impossible."),
+        Treatment(Subject.PLACE, "used", "The `.TIL` of the product places a tile in its image."),
+        Treatment(
+            Subject.PLACE,
+            "assumed",
+            "An image of another size than NUMROWS x NUMCOLUMNS begins at the first pixel.",
+        ),
+        Treatment(Subject.ORDER, "refused", "A SPECID that is not RPC00B."),
+        Treatment(Subject.ACCURACY, "used", "ERRBIAS and ERRRAND, metres, where they are positive."),
+        Treatment(Subject.ACCURACY, "assumed", "That of the sensor, where they are zero."),
+        Treatment(Subject.IDENTITY, "used", "SATID, FIRSTLINETIME and the angles of the sun."),
+    ),
+    never=(
+        Subject.PIXEL_ORIGIN,
+        Subject.HORIZONTAL_DATUM,
+        Subject.VERTICAL_DATUM,
+        Subject.UNIT,
+        Subject.EPOCH,
+        Subject.VALIDITY,
+        Subject.BANDS,
+    ),
+)
 
 _LIGHT_PATH = LightPath(velocity_aberration=True, light_time=True, refraction=True)
 
