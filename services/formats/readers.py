@@ -1,9 +1,30 @@
 """All readers of files that others write, with what becomes of each statement in such a file."""
 
 from amers.services.formats.gcp.rows import POINT_READERS
+from amers.services.formats.images import georeference, scenes
 from amers.services.formats.reader_rows import Reader
+from amers.services.formats.sensor_models import (
+    dimap,
+    geom,
+    product_documents,
+    rigorous_model,
+    rpc_text,
+    worldview_isd,
+)
 
-READERS: tuple[Reader, ...] = (*POINT_READERS,)
+READERS: tuple[Reader, ...] = (
+    *POINT_READERS,
+    scenes.READER,
+    rpc_text.RPC_TEXT_READER,
+    rpc_text.RPB_READER,
+    worldview_isd.READER,
+    dimap.READER,
+    geom.READER,
+    product_documents.READER,
+    rigorous_model.READER,
+    georeference.AUX_READER,
+    georeference.WORLD_FILE_READER,
+)
 """In the order of `docs/inputs.md`."""
 
 OWN_FILES = frozenset(
@@ -29,6 +50,9 @@ PARTS = frozenset(
     {
         "load_json",
         "open_dataset",
+        "open_image",
+        "open_tiles",
+        "read_model_file",
         "open_pixels",
         "parse_area",
         "parse_bands",

@@ -164,7 +164,7 @@ def read_scene(
         *source.statements,
         *delivered.statements,
         *_unused_grid(image, delivered),
-        *_identity(acquisition, delivered),
+        *_identity(acquisition, image, delivered),
         *accuracy,
     )
     if rigorous is None:
@@ -234,9 +234,10 @@ def _accuracy(delivered: DeliveredModel, sensor: str, sigma_m: float | None) -> 
     return prior_m, (Statement(name, Subject.ACCURACY, Use.ASSUMED, value, note=note),)
 
 
-def _identity(acquisition: Acquisition, delivered: DeliveredModel) -> Statements:
-    """The sensor and the time that the files of an image state."""
-    words = [acquisition.sensor]
+def _identity(acquisition: Acquisition, image: SceneImage, delivered: DeliveredModel) -> Statements:
+    """The name, the sensor and the time that the files of an image state."""
+    is_named = acquisition.image_id != image.path.stem
+    words = [acquisition.image_id if is_named else "", acquisition.sensor]
     if acquisition.acquired_at is not None:
         words.append(f"{acquisition.acquired_at:%Y-%m-%d %H:%M:%S} UTC")
     value = ", ".join(word for word in words if word)

@@ -56,8 +56,22 @@ def open_image(path: FilePlace, bands: int | BandMix | None = 1) -> SceneImage:
         image = open_raster(files[0], bands)
         return replace(image, statements=(*image.statements, *others))
     parts = [(file, tile.first, tile.shape) for file, tile in zip(files, tiles, strict=True)]
+    _refuse_overlaps(tiles)
     tiled = open_tiles(path, tiles[0].product_shape, parts, bands)
-    return replace(tiled, statements=(*tiled.statements, *others))
+    size = f"{tiled.shape[0]} x {tiled.shape[1]} pixels"
+    whole = Statement(path.name, Subject.PLACE, Use.USED, size, where=f"{len(tiles)} tiles")
+    return replace(tiled, statements=(*tiled.statements, whole, *others))
+
+
+def _refuse_overlaps(tiles: list[ProductTile]) -> None:
+    for k, one in enumerate(tiles):
+        for other in tiles[:k]:
+            ends = zip(one.first, one.shape, other.first, other.shape, strict=True)
+            if all(a < b + b_size and b < a + a_size for a, a_size, b, b_size in ends):
+                raise FormatError(
+                    f"{one.document.name}: {other.name} and {one.name} overlap, tiles side by side "
+                    "expected"
+                )
 
 
 def tile_file(tile: ProductTile) -> FilePlace:

@@ -10,6 +10,7 @@ import numpy as np
 
 from amers.services.errors import FormatError
 from amers.services.formats.addresses import FilePlace
+from amers.services.formats.images.georeference import georeference
 from amers.services.formats.images.raster import RasterImage, copy_with_rpc
 from amers.services.formats.images.siblings import Siblings
 from amers.services.formats.images.tiled_image import SceneImage, TiledImage
@@ -335,6 +336,12 @@ def _no_model(image: SceneImage, siblings: Siblings) -> str:
         f"file {', '.join(names)} lies beside it; add one of these, or give the file of the model "
         "(--model)"
     )
+    map_grid = georeference(image.path, image.dataset)
+    if not map_grid.transform.is_identity and map_grid.statements:
+        message += (
+            f"; {map_grid.statements[0].file} has a geotransform and no reference system: add "
+            f"{image.path.stem}.prj with it as WKT"
+        )
     if image.dataset.gcps[0]:
         message += (
             f"; it has {len(image.dataset.gcps[0])} ground control points, to which no model is fitted: "
