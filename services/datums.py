@@ -50,8 +50,10 @@ class DatumShift:
         """What the operation adds to the sigma of positions: its accuracy, unless it is null."""
         return 0.0 if self.is_null or math.isnan(self.accuracy_m) else self.accuracy_m
 
-    def statement(self, file: str, where: str = "reference system") -> Statement:
-        """The statement of a file in this system."""
+    def statement(
+        self, file: str, where: str = "reference system", *, has_sigmas: bool = True
+    ) -> Statement:
+        """The statement of a file in this system, whose positions have sigmas or not."""
         if self.is_assumed:
             note = (
                 "the file names no datum, on an ellipsoid of WGS 84: its positions are taken as WGS 84"
@@ -65,7 +67,7 @@ class DatumShift:
             note = f"{self.name}, accuracy {self.accuracy_m:.3g} m"
             if self.is_null:
                 note += ", which leaves positions as they are"
-            elif self.sigma_m > 0.0:
+            elif has_sigmas:
                 note += ", which enters the sigmas"
         return Statement(
             file, Subject.HORIZONTAL_DATUM, Use.USED, self.system, where, note + self.missing

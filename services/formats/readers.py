@@ -1,5 +1,6 @@
 """All readers of files that others write, with what becomes of each statement in such a file."""
 
+from amers.services.formats.elevation.rows import TERRAIN_READERS
 from amers.services.formats.gcp.rows import POINT_READERS
 from amers.services.formats.images import georeference, scenes
 from amers.services.formats.reader_rows import Reader
@@ -24,6 +25,7 @@ READERS: tuple[Reader, ...] = (
     rigorous_model.READER,
     georeference.AUX_READER,
     georeference.WORLD_FILE_READER,
+    *TERRAIN_READERS,
 )
 """In the order of `docs/inputs.md`."""
 
@@ -53,6 +55,7 @@ PARTS = frozenset(
         "open_image",
         "open_tiles",
         "read_model_file",
+        "open_heights",
         "open_pixels",
         "parse_area",
         "parse_bands",
@@ -76,6 +79,7 @@ PARTS = frozenset(
         "read_or_missing",
         "read_rpc",
         "read_text",
+        "read_tile",
         "read_used_points",
         "open_base_chip",
         "read_base_chips",

@@ -10,8 +10,7 @@ from amers.services.datums import DatumShift
 from amers.services.errors import AmersError, FormatError
 from amers.services.formats.elevation.grid_files import HEIGHTS_OF_FORMAT, HeightsImage, open_heights
 from amers.services.formats.elevation.heights import HeightDatum, HeightsByCaller, height_datum
-from amers.services.formats.images.geokeys import coordinate_epoch
-from amers.services.formats.images.georeference import georeference
+from amers.services.formats.images.map_statements import map_statements
 from amers.services.formats.images.raster import map_grid_of, shift_of_grid
 from amers.services.imagery.source import Window
 from amers.services.map_grid import MapGrid
@@ -107,8 +106,7 @@ def read_tile(
     of_datum = (replace(statement, file=path.name) for statement in datum.statements)
     statements = (
         *image.statements,
-        *georeference(path, image.dataset).statements,
-        shift.statement(path.name),
+        *map_statements(image, grid, shift, has_sigmas=False),
         *of_datum,
         *_of_values(image),
     )
@@ -134,27 +132,19 @@ def _datums(
 
 
 def _of_values(image: HeightsImage) -> Statements:
-    """What a file states of its values: where their nodes are, voids, scale, epoch, other bands."""
+    """What a file states of its values: voids, scale, other bands."""
     name, dataset = image.path.name, image.dataset
-    used = Statement(name, Subject.PIXEL_ORIGIN, Use.USED, "", "band 1")
-    point = dataset.tags().get("AREA_OR_POINT", "")
-    origin = replace(used, where="AREA_OR_POINT", value=point or "Area", note="as GDAL places its nodes")
-    if not point:
-        origin = replace(origin, use=Use.ASSUMED, where="", note="the corner of a cell is its origin")
+    used = Statement(name, Subject.UNIT, Use.USED, "", "band 1")
     others: list[Statement] = []
+    if dataset.driver == "SRTMHGT":
+        others.append(Statement(name, Subject.PLACE, Use.USED, name[:7], "name of the file"))
     if not image.validity.is_stated(1):
         note = f"voids are {UNDECLARED_VOID:g}, and heights that no ground has"
         others.append(Statement(name, Subject.VALIDITY, Use.ASSUMED, "no value for voids", note=note))
     if (image.scale, image.offset) != (1.0, 0.0):
         value = f"scale {image.scale:g}, offset {image.offset:g}"
-        others.append(replace(used, subject=Subject.UNIT, value=value))
+        others.append(replace(used, value=value))
     if dataset.count > 1:
         value = f"bands 2 to {dataset.count}"
         others.append(Statement(name, Subject.BANDS, Use.NOT_USED, value, note="heights are band 1"))
-    epoch = coordinate_epoch(image.path) if isinstance(image.path, Path) else None
-    if epoch is not None:
-        note = "positions are taken as WGS 84 of today; plates move up to 0.1 m a year"
-        others.append(
-            Statement(name, Subject.EPOCH, Use.NOT_USED, f"{epoch:.2f}", "CoordinateEpochGeoKey", note)
-        )
-    return origin, *others
+    return tuple(others)

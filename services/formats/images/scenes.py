@@ -13,6 +13,7 @@ from amers.services.formats.addresses import FilePlace
 from amers.services.formats.images.band_registration import with_registered_bands
 from amers.services.formats.images.bands import BandMix
 from amers.services.formats.images.georeference import georeference
+from amers.services.formats.images.map_statements import map_statements, unused_heights
 from amers.services.formats.images.masks import MaskedImage, apply_mask
 from amers.services.formats.images.raster import map_grid_of, shift_of_grid
 from amers.services.formats.images.siblings import Siblings
@@ -205,14 +206,14 @@ def _ortho_scene(image: SceneImage, grid: MapGrid, sigma_m: float | None, mask: 
     if sigma_m is None:
         sigma_m = _ortho_sigma_m(image.path, acquisition.sensor)
     shift = shift_of_grid(image, grid)
-    stated = georeference(image.path, image.dataset).statements
+    stated = map_statements(image, grid, shift) + unused_heights(image, grid)
     source = _masked(image, mask)
     return Scene(
         source,
         OrthoModel(grid),
         acquisition,
         math.hypot(sigma_m, shift.sigma_m),
-        statements=(*source.statements, *stated, shift.statement(image.path.name)),
+        statements=(*source.statements, *stated),
     )
 
 
