@@ -9,6 +9,7 @@ from amers.app.errors import AmersError, ComputationError, InputError
 from amers.app.usecases.registration.register import SceneFiles
 from amers.services import errors
 from amers.services.formats.images.scenes import model_files
+from amers.services.formats.sensor_models.product_image import files_to_send
 from amers.services.types import Progress, part_of
 
 UPLOAD_SHARE = 0.2
@@ -45,12 +46,15 @@ def register(
     """
     # The model is read to check it before anything is sent.
     models = model_files(files.image, files.model)
+    image = files_to_send(files.image)[0]
     optional_files = [path for path in (files.mask, files.check_points) if path is not None]
     upload_progress = part_of(progress, 0.0, UPLOAD_SHARE)
-    scene = client.upload_scene(files.image, sigma_m=files.sigma_m, progress=upload_progress)
+    scene = client.upload_scene(image, sigma_m=files.sigma_m, progress=upload_progress)
     names = {path: client.upload_file(scene, path) for path in [*models, *optional_files]}
     paths = {"model": files.model, "mask": files.mask, "check_points": files.check_points}
     values = {"bands": files.bands, "check_heights": files.check_heights}
+    if files.crop_origin is not None:
+        values["crop_origin"] = "{},{}".format(*files.crop_origin)
     inputs = {
         "scene": scene,
         "copy_image": copy_image,

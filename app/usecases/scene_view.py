@@ -14,8 +14,8 @@ from amers.app.usecases.processes import Commit, Process, Work
 from amers.app.usecases.results import store_results
 from amers.app.usecases.scene_inputs import check_scene, present_scene
 from amers.app.usecases.scenes import local_image, stored_keys
-from amers.services.formats.images.raster import open_raster
 from amers.services.formats.images.tiles import TileIndex, format_tile_index, write_tiles
+from amers.services.formats.sensor_models.product_image import open_image
 
 INDEX_NAME, TILES_NAME = "tiles.json", "tiles.bin"
 
@@ -55,7 +55,7 @@ def _run(work: Work) -> Commit:
 
 
 def _write(image: Path, tiles: Path, work: Work) -> TileIndex:
-    raster = open_raster(image, None)
+    raster = open_image(image, None)
     try:
         return write_tiles(raster, tiles, work.progress)
     finally:

@@ -25,13 +25,18 @@ from amers.app.usecases.installation import Installation
 from amers.app.usecases.server_files import file_below
 from amers.services.errors import FormatError
 from amers.services.formats.images.signatures import DRIVER_OF_SIGNATURE
+from amers.services.formats.sensor_models.product_image import whole_product
 
 LONGEST_NAME = 120
 LONGEST_SIGNATURE = max(len(signature) for signature in DRIVER_OF_SIGNATURE)
-MODEL_SUFFIXES = (".txt", ".xml", ".rpb", ".rpc", ".geom")
+MODEL_SUFFIXES = (
+    *(".txt", ".xml", ".rpb", ".rpc", ".geom"),
+    *(".dim", ".til", ".imd", ".tfw", ".j2w", ".prj"),
+)
+"""Models, and what places an image in a product or on a map."""
 MARK_SUFFIXES = (".geojson", ".json", ".gcp", ".points", ".pts")
-RASTER_SUFFIXES = (".tif", ".tiff", ".jp2", ".gtx")
-"""Terrains, masks and geoid grids: they may be as large as images."""
+RASTER_SUFFIXES = (".tif", ".tiff", ".jp2", ".ntf", ".nitf", ".msk", ".gtx")
+"""Terrains, masks, geoid grids and other tiles of the image: they may be as large as images."""
 VECTOR_SUFFIXES = (".fgb",)
 """Vectors in a format of their own; they may be GeoJSON too."""
 SIDE_FILE_SUFFIXES = MODEL_SUFFIXES + MARK_SUFFIXES + RASTER_SUFFIXES + VECTOR_SUFFIXES
@@ -260,6 +265,8 @@ def server_image(settings: Settings, path: str) -> Path:
 def local_image(storage: Storage, settings: Settings, scene: SceneRow, scratch: Path) -> Path:
     """The path of a scene's image on this machine, with its other files in the same folder.
 
+    Of a scene whose files are all tiles of a product, it is the path of the product's document.
+
     Args:
         storage, settings: of the installation.
         scene: the scene.
@@ -271,7 +278,7 @@ def local_image(storage: Storage, settings: Settings, scene: SceneRow, scratch: 
         DamagedFile: a file of the scene is missing from the storage.
     """
     if scene.reference is not None and scene.state != "removed":
-        return server_image(settings, scene.reference)
+        return whole_product(server_image(settings, scene.reference))
     if scene.file_key is None:
         raise Conflict(f"scene {scene.id} was removed, or its image has not arrived yet")
     image, *beside = stored_keys(scene)
@@ -279,7 +286,7 @@ def local_image(storage: Storage, settings: Settings, scene: SceneRow, scratch: 
         with named_by_row(key):
             storage.fetch(key, scratch)
     with named_by_row(image):
-        return storage.fetch(image, scratch)
+        return whole_product(storage.fetch(image, scratch))
 
 
 def stored_keys(scene: SceneRow) -> list[str]:

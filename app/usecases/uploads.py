@@ -40,7 +40,8 @@ from amers.services.formats.archives import (
     is_archive,
     unpack_archive,
 )
-from amers.services.formats.sensor_models.product_image import IMAGE_SUFFIXES
+from amers.services.formats.sensor_models.product_documents import without_tile
+from amers.services.formats.sensor_models.product_image import IMAGE_SUFFIXES, whole_product
 
 PURPOSES: tuple[UploadPurpose, ...] = ("image", "model", "block")
 UPLOAD_PREFIX = "upload-"
@@ -365,10 +366,7 @@ def _complete_image(installation: Installation, upload: UploadRow, path: Path, s
                 sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         require_image_signature(head)
         size_bytes = image.stat().st_size
-        model_files = [
-            (model.name, model.stat().st_size, hashlib.sha256(model.read_bytes()).hexdigest())
-            for model in models
-        ]
+        model_files = [(model.name, model.stat().st_size, _file_sha256(model)) for model in models]
         for source in [*models, image]:
             file_name = name if source == path else source.name
             storage.link(source, f"{folder_of(upload.scene_id)}/{file_name}")
@@ -381,10 +379,17 @@ def _complete_image(installation: Installation, upload: UploadRow, path: Path, s
         uploads.finish(connection, upload.id)
 
 
+def _file_sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def _unpack(
     installation: Installation, upload: UploadRow, archive: Path, folder: Path
 ) -> tuple[Path, list[Path]]:
-    """Unpack the one image of an archive and the models beside it into a folder; returns their paths.
+    """Unpack the image of an archive, and the files beside it, into a folder; returns their paths.
+
+    An image in several tiles is the first tile, beside which the others are.
 
     What the archive declares to unpack to is reserved from the owner's quota first.
 
@@ -396,11 +401,16 @@ def _unpack(
     settings = installation.settings
     limits = ArchiveLimits(settings.upload_limit_bytes)
     members = check_archive(archive, limits)
-    images = [member.path for member in members if member.path.suffix.lower() in IMAGE_SUFFIXES]
-    if len(images) != 1:
+    paths = sorted(member.path for member in members)
+    images = [path for path in paths if path.suffix.lower() in IMAGE_SUFFIXES]
+    wholes = {(path.parent, without_tile(path.stem)) for path in images}
+    if len(wholes) != 1:
         names = ", ".join(str(path) for path in images[:5]) or "none"
-        raise InputError(f"the archive contains {len(images)} images ({names}), exactly one is expected")
-    models = [
+        raise InputError(
+            f"the archive contains {len(images)} images ({names}), exactly one is expected, or the "
+            "tiles of one product"
+        )
+    models = images[1:] + [
         member.path
         for member in members
         if member.path.parent == images[0].parent
@@ -423,4 +433,9 @@ def _unpack(
             quotas.require_room(connection, settings, upload.owner, what, more_bytes)
             scenes.reserve(connection, upload.scene_id, more_bytes)
     unpack_archive(archive, targets, ArchiveLimits(max(unpacked_bytes, 1)))
+    if len(images) > 1 and whole_product(targets[images[0]]) == targets[images[0]]:
+        raise InputError(
+            f"the archive contains {len(images)} images, exactly one is expected, or all tiles of one "
+            "product with the document that lists them (DIM_….XML, .TIL)"
+        )
     return targets[images[0]], [targets[path] for path in models]

@@ -26,19 +26,21 @@ from amers.app.config import Settings
 from amers.app.db import engine
 from amers.app.db import uploads as upload_rows
 from amers.app.db.engine import Connection
+from amers.app.db.scenes import newest_scenes
 from amers.app.db.tokens import list_tokens
 from amers.app.db.uploads import LIFE_HOURS
 from amers.app.errors import Conflict, InputError, NotFound
 from amers.app.main import create_app
 from amers.app.storage import Storage
 from amers.app.usecases.blocks.uploads import find_uploaded_block
-from amers.app.usecases.scenes import SIDE_FILE_LIMIT_BYTES
+from amers.app.usecases.scenes import SIDE_FILE_LIMIT_BYTES, local_image
 from amers.app.usecases.uploads import UPLOAD_PREFIX, remove_abandoned_uploads
 from amers.app.worker.sweep import sweep_files
 from tests.app.callers import Bearer, Caller
 from tests.app.conftest import stored_files
 from tests.app.ledger import bytes_in_ledger, bytes_in_storage, make_token
 from tests.app.point_history import let_pass
+from tests.services.formats.statements.scene_files import til
 from tests.statements import run_sql
 
 TIFF = b"II*\0" + np.random.default_rng(1).bytes(300_000)
@@ -291,6 +293,38 @@ def test_an_archive_with_an_image_and_its_model_becomes_a_scene(
     assert (scene["file"], scene["models"]) == ("IMG_1.TIF", ["RPC_1.XML"])
     assert scene["sha256"] == hashlib.sha256(TIFF).hexdigest()
     assert storage.keys("scenes") == [f"scenes/{scene['id']}/{n}" for n in ("IMG_1.TIF", "RPC_1.XML")]
+
+
+def tiles_of_a_product() -> dict[str, bytes]:
+    """An image in two tiles, with the file that lists them and the model of the whole."""
+    boxes = [("a_R1C1.TIF", 0, 0, 59, 79), ("a_R2C1.TIF", 60, 0, 119, 79)]
+    return {
+        "delivery/a.TIL": til(boxes).encode(),
+        "delivery/a.RPB": b"satId = ...",
+        **{f"delivery/{name}": TIFF[:1000] for name, *_ in boxes},
+    }
+
+
+def test_the_tiles_of_a_product_become_one_scene_that_is_read_whole(
+    client: TestClient,
+    me: Caller,
+    connection: Connection,
+    storage: Storage,
+    settings: Settings,
+    tmp_path: Path,
+) -> None:
+    reply = whole(client, me, zipped(tiles_of_a_product()), filename="delivery.zip")
+    assert reply.status_code == 204, reply.text
+    (row,) = newest_scenes(connection, None, 2)
+    assert row.file_name == "a_R1C1.TIF"
+    assert set(row.models) == {"a_R2C1.TIF", "a.TIL", "a.RPB"}
+    assert local_image(storage, settings, row, tmp_path).name == "a.TIL"
+
+
+def test_tiles_without_the_document_that_lists_them_are_refused(client: TestClient, me: Caller) -> None:
+    files = {name: content for name, content in tiles_of_a_product().items() if "TIL" not in name}
+    reply = whole(client, me, zipped(files), filename="delivery.zip")
+    assert "all tiles of one product with the document that lists them" in reply.text
 
 
 @pytest.mark.parametrize(("room", "status"), [(0, 204), (-1, 413)])

@@ -15,6 +15,7 @@ from amers.app.db.scenes import SceneRow
 from amers.app.db.tokens import Token
 from amers.app.errors import AmersError, ComputationError, InputError, TooLarge, is_no_memory
 from amers.app.usecases.damage import suspecting_damage
+from amers.app.usecases.model_choice import parse_crop_origin
 from amers.app.usecases.processes import Commit, Process, Work, WorkFailed
 from amers.app.usecases.references import references_of_store
 from amers.app.usecases.registration.control_sources import points_of_store
@@ -55,6 +56,8 @@ class RegisterScene:
         mask: name of an image of the same ground; pixels are not used where it is not zero.
         check_points: name of a file with points that are held out of the registration.
         check_heights: vertical datum of the check points' heights, where their format cannot state it.
+        crop_origin: LINE,SAMPLE of the image's first pixel in the image that the model is for; by
+            default as its files state it.
         copy_image: whether a GeoTIFF is copied to the outputs with the refined model in its tags.
         options: of the registration.
     """
@@ -67,6 +70,7 @@ class RegisterScene:
     mask: str | None = None
     check_points: str | None = None
     check_heights: str | None = None
+    crop_origin: str | None = None
     copy_image: bool = False
     options: RegistrationOptions = field(default_factory=RegistrationOptions)
 
@@ -78,6 +82,8 @@ def _check(connection: Connection, caller: Token, inputs: RegisterScene) -> None
         raise InputError(f"sigma_m: {inputs.sigma_m} found, metres above 0 expected")
     if inputs.bands is not None:
         parse_bands(inputs.bands)
+    if inputs.crop_origin is not None:
+        parse_crop_origin(inputs.crop_origin, "crop_origin")
     if inputs.check_heights is not None:
         with naming("check_heights"):
             check_heights(inputs.check_heights)
@@ -192,6 +198,7 @@ def scene_files(inputs: RegisterScene, image: Path, sigma_m: float | None) -> Sc
         mask=beside(inputs.mask),
         check_points=beside(inputs.check_points),
         check_heights=inputs.check_heights,
+        crop_origin=None if inputs.crop_origin is None else parse_crop_origin(inputs.crop_origin),
     )
 
 

@@ -274,12 +274,13 @@ def model_files(path: Path, model_path: Path | None = None) -> list[Path]:
     product = delivered.path.with_name(_product_name(delivered.path))
     documents: list[FilePlace] = []
     if isinstance(image, TiledImage):
-        documents = [image.path, *(tile.path for tile in image.tiles)]
+        documents = [image.path, *(tile.path for tile in image.tiles[1:])]
     elif delivered.place is not None and delivered.place.file:
         documents = [image.path.with_name(delivered.place.file)]
     candidates = dict.fromkeys([delivered.path, product, *documents])
     beside = [file for file in candidates if isinstance(file, Path) and file.is_file()]
-    return [file for file in beside if file.resolve() != path.resolve()]
+    own = image.tiles[0].path if isinstance(image, TiledImage) else image.path
+    return [file for file in beside if file.resolve() != Path(str(own)).resolve()]
 
 
 def prior_sigma_m(model: RpcModel, sensor: str) -> float:

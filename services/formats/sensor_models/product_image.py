@@ -7,12 +7,14 @@ from amers.services.errors import FormatError
 from amers.services.formats.addresses import Address, FilePlace
 from amers.services.formats.images.bands import BandMix
 from amers.services.formats.images.raster import open_raster
-from amers.services.formats.images.tiled_image import SceneImage, open_tiles
+from amers.services.formats.images.siblings import Siblings
+from amers.services.formats.images.tiled_image import SceneImage, TiledImage, open_tiles
 from amers.services.formats.members import folder_member
 from amers.services.formats.sensor_models.product_documents import (
     ProductTile,
     is_document,
     read_product,
+    tile_of_product,
 )
 from amers.services.formats.text_files import read_text
 from amers.services.statements import Statement, Subject, Use
@@ -69,9 +71,37 @@ def _refuse_overlaps(tiles: list[ProductTile]) -> None:
             ends = zip(one.first, one.shape, other.first, other.shape, strict=True)
             if all(a < b + b_size and b < a + a_size for a, a_size, b, b_size in ends):
                 raise FormatError(
-                    f"{one.document.name}: {other.name} and {one.name} overlap, tiles side by side "
-                    "expected"
+                    f"{one.document.name}: {other.name} and {one.name} overlap, "
+                    "tiles side by side expected"
                 )
+
+
+def whole_product(image: Path) -> Path:
+    """The document of the product of which an image is a tile, where all tiles are there; else the image.
+
+    Raises:
+        FormatError: a document beside the image cannot be used.
+    """
+    tile = tile_of_product(image, Siblings(image))
+    if tile is None:
+        return image
+    tiles = read_product(tile.document)
+    is_whole = all(tile_file(other).is_file() for other in tiles)
+    return tile.document if is_whole and isinstance(tile.document, Path) else image
+
+
+def files_to_send(path: Path) -> list[Path]:
+    """The image file of a path as for `open_image`, then the other files of the same product, if any.
+
+    Raises:
+        FormatError: the document of the product cannot be used.
+    """
+    image = open_image(path)
+    image.close()
+    if not isinstance(image, TiledImage):
+        return [Path(str(image.path))]
+    files = [*(tile.path for tile in image.tiles), image.path]
+    return [file for file in files if isinstance(file, Path)]
 
 
 def tile_file(tile: ProductTile) -> FilePlace:
