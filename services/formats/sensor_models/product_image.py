@@ -77,7 +77,7 @@ def _refuse_overlaps(tiles: list[ProductTile]) -> None:
 
 
 def whole_product(image: Path) -> Path:
-    """The document of the product of which an image is a tile, where all tiles are there; else the image.
+    """The document of the product that an image is a tile of, where all tiles are there; else the image.
 
     Raises:
         FormatError: a document beside the image cannot be used.

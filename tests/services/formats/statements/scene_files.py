@@ -97,6 +97,7 @@ def isd(model: RpcModel, shape: tuple[int, int] = SHAPE, specification: str = "R
         )
     bias = numbers.get("ERR_BIAS", 0.0)
     return (
+        '<?xml version="1.0" encoding="UTF-8"?>'
         f"<isd><IMD><NUMROWS>{shape[0]}</NUMROWS><NUMCOLUMNS>{shape[1]}</NUMCOLUMNS></IMD><RPB>"
         f"<SATID>WV02</SATID><SPECID>{specification}</SPECID><IMAGE><ERRBIAS>{bias}</ERRBIAS>"
         f"<ERRRAND>0.0</ERRRAND>{''.join(rows)}</IMAGE></RPB></isd>"
