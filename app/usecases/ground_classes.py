@@ -67,7 +67,7 @@ def read_ground(files: GroundFiles) -> GroundClasses:
     Raises:
         InputError: a file cannot be read.
     """
-    masks = [read_ground_mask(path) for path in files.exclude]
+    masks: list[GroundMask] = [read_ground_mask(path) for path in files.exclude]
     cover = None if files.land_cover is None else read_land_cover(files.land_cover)
     if cover is not None:
 

@@ -20,7 +20,8 @@ from amers.app.usecases.vector_files import (
     refuse_overwriting,
     write_vertices,
 )
-from amers.services.formats.vector.layers import VectorLayer, read_layer, write_layer
+from amers.services.formats.vector.layers import VectorLayer, write_layer
+from amers.services.formats.vector.map_layers import read_map_layer, read_pixel_layer
 from amers.services.formats.vector.pixel_coordinates import (
     PixelOrigin,
     check_inside,
@@ -155,7 +156,7 @@ def correct_file(
         check_map_code(crs)
     scene, registration = read_raw_scene(scene_model)
     ground = read_terrain(terrain)
-    layer = read_layer(vectors.path, vectors.layer)
+    layer = read_pixel_layer(vectors.path, vectors.layer)
     shapes = _in_image(layer, scene, options)
     sources = _error_sources(scene_model, registration, ground, options)
     crs = crs or default_crs(output, scene)
@@ -257,7 +258,7 @@ def project_file(
     refuse_overwriting(vectors.path, output, vertices)
     scene, _ = read_raw_scene(scene_model)
     ground = read_terrain(terrain)
-    layer = read_layer(vectors.path, vectors.layer)
+    layer = read_map_layer(vectors.path, vectors.layer)
     crs = _map_of(vectors, layer)
     near = _near(layer, ground_outline(scene, ground, crs), clip=options.clip)
     projected = project_vectors(shapes_of(near), scene, ground, crs, tolerance_px=options.tolerance_px)

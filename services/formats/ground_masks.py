@@ -1,18 +1,24 @@
 """Masks and land cover of the ground in files: GeoJSON polygons, or images on a map."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import shapely
+from rasterio.enums import ColorInterp
 
+from amers.services.datums import horizontal
 from amers.services.errors import FormatError
-from amers.services.formats.images.raster import RasterImage, map_grid_of, open_values
+from amers.services.formats.gcp.record import Record
+from amers.services.formats.images.raster import RasterImage, map_grid_of, open_raster
+from amers.services.formats.reader_rows import Reader, Treatment
 from amers.services.formats.stac.catalogue import parse_area
 from amers.services.formats.text_files import load_json, read_text
 from amers.services.imagery.source import Window
 from amers.services.map_grid import MapGrid
 from amers.services.quality.density import GroundMask
+from amers.services.statements import Statements, Subject
 from amers.services.types import Array, BoolArray, IntArray
 
 LandCover = Callable[[Array], list[str]]
@@ -36,39 +42,121 @@ WORLD_COVER = {
 _TILE_PX = 1024
 
 
-def read_ground_mask(path: Path) -> GroundMask:
+READER = Reader(
+    "Masks and land cover of the ground",
+    ("read_ground_mask", "read_land_cover"),
+    (
+        Treatment(Subject.HORIZONTAL_DATUM, "used", "of an image on a map"),
+        Treatment(Subject.HORIZONTAL_DATUM, "assumed", "WGS 84 of polygons in GeoJSON"),
+        Treatment(
+            Subject.HORIZONTAL_DATUM, "refused", "none of an image; another than WGS 84 in GeoJSON"
+        ),
+        Treatment(Subject.ORDER, "refused", "latitudes beyond 90 degrees"),
+        Treatment(Subject.VALIDITY, "used", "nodata: such ground is not excluded, its cover is unknown"),
+        Treatment(
+            Subject.BANDS, "refused", "several bands of land cover: which has the classes is open"
+        ),
+        Treatment(Subject.IDENTITY, "assumed", "classes of ESA WorldCover, where there are no others"),
+        Treatment(Subject.IDENTITY, "named", "properties of the polygons: all of them are excluded"),
+    ),
+    (
+        Subject.MODEL,
+        Subject.PLACE,
+        Subject.PIXEL_ORIGIN,
+        Subject.VERTICAL_DATUM,
+        Subject.UNIT,
+        Subject.EPOCH,
+        Subject.ACCURACY,
+    ),
+)
+
+
+@dataclass(frozen=True)
+class ExcludedGround:
+    """The ground that a file excludes: a `GroundMask`.
+
+    Attributes:
+        excludes: whether positions (n, 2) of longitude and latitude are excluded.
+        statements: of the file.
+    """
+
+    excludes: GroundMask
+    statements: Statements = ()
+
+    def __call__(self, lon_lat: Array) -> BoolArray:
+        """Which positions (n, 2) are excluded."""
+        return self.excludes(lon_lat)
+
+
+@dataclass(frozen=True)
+class CoveredGround:
+    """The land cover of the ground in a file: a `LandCover`.
+
+    Attributes:
+        names: of the land cover at positions (n, 2) of longitude and latitude.
+        statements: of the file.
+    """
+
+    names: LandCover
+    statements: Statements = ()
+
+    def __call__(self, lon_lat: Array) -> list[str]:
+        """The land cover at positions (n, 2)."""
+        return self.names(lon_lat)
+
+
+def read_ground_mask(path: Path) -> ExcludedGround:
     """The ground that a file excludes: polygons in GeoJSON, or pixels of an image on a map other than 0.
 
-    Ground beyond the image, and its pixels without data, are not excluded. The image stays open.
+    Ground beyond the image, and its pixels without data, are not excluded. Of a colour table, the index
+    counts. The image stays open.
 
     Raises:
         FormatError: the file cannot be read, has no polygon, or is an image on no map.
     """
     if path.suffix.lower() in (".json", ".geojson"):
-        area = parse_area(load_json(read_text(path), str(path)), str(path))
-        shapely.prepare(area)
-
-        def inside(lon_lat: Array) -> BoolArray:
-            return np.asarray(shapely.contains_xy(area, lon_lat[:, 0], lon_lat[:, 1]))
-
-        return inside
-    image, grid = _on_map(path)
+        return _polygons(path)
+    image, grid, statements = _on_map(path)
 
     def covered(lon_lat: Array) -> BoolArray:
         return np.asarray(np.nan_to_num(_values(image, grid, lon_lat)) != 0.0)
 
-    return covered
+    return ExcludedGround(covered, statements)
 
 
-def read_land_cover(path: Path) -> LandCover:
+def _polygons(path: Path) -> ExcludedGround:
+    document = load_json(read_text(path), str(path))
+    area = parse_area(document, str(path))
+    shapely.prepare(area)
+
+    def inside(lon_lat: Array) -> BoolArray:
+        return np.asarray(shapely.contains_xy(area, lon_lat[:, 0], lon_lat[:, 1]))
+
+    record = Record(path.name)
+    record.assumed(Subject.HORIZONTAL_DATUM, "WGS 84", "", "RFC 7946")
+    features = document.get("features") or [document]
+    names = {name: None for feature in features for name in feature.get("properties") or {}}
+    if names:
+        record.not_used(Subject.IDENTITY, ", ".join(names)[:80], "properties")
+    return ExcludedGround(inside, tuple(record.statements))
+
+
+def read_land_cover(path: Path) -> CoveredGround:
     """The land cover in an image on a map: names of ESA WorldCover if it has only its classes.
 
     Otherwise the classes are named by their numbers. The image stays open.
 
     Raises:
-        FormatError: the image cannot be read, or is on no map.
+        FormatError: the image cannot be read, is on no map, or has several bands.
     """
-    image, grid = _on_map(path)
+    image, grid, statements = _on_map(path)
+    bands = [band for band in image.dataset.colorinterp if band is not ColorInterp.alpha]
+    if len(bands) > 1:
+        image.close()
+        raise FormatError(
+            f"{path}: expected land cover in one band, found {len(bands)}; write the one with "
+            "the classes into a file of its own (gdal_translate -b)"
+        )
 
     def cover(lon_lat: Array) -> list[str]:
         values = _values(image, grid, lon_lat)
@@ -82,10 +170,12 @@ def read_land_cover(path: Path) -> LandCover:
 
         return [name(value) for value in values.tolist()]
 
-    return cover
+    record = Record(path.name, list(statements))
+    record.assumed(Subject.IDENTITY, "classes of ESA WorldCover", "", "others keep their numbers")
+    return CoveredGround(cover, tuple(record.statements))
 
 
-def any_of(masks: list[GroundMask]) -> GroundMask | None:
+def any_of(masks: Sequence[GroundMask]) -> GroundMask | None:
     """The ground that at least one of some masks excludes; None without masks."""
     if not masks:
         return None
@@ -96,8 +186,9 @@ def any_of(masks: list[GroundMask]) -> GroundMask | None:
     return covered
 
 
-def _on_map(path: Path) -> tuple[RasterImage, MapGrid]:
-    image = open_values(path)
+def _on_map(path: Path) -> tuple[RasterImage, MapGrid, Statements]:
+    """An image, its map, and its statements; values of a colour table are classes, not grey."""
+    image = open_raster(path)
     grid = map_grid_of(image)
     if grid is None:
         image.close()
@@ -105,7 +196,10 @@ def _on_map(path: Path) -> tuple[RasterImage, MapGrid]:
             f"{path}: no coordinate reference system found, polygons in GeoJSON or an image on a map "
             "expected"
         )
-    return image, grid
+    of_pixels = [one for one in image.statements if one.subject is not Subject.BANDS]
+    record = Record(path.name, of_pixels)
+    record.used(Subject.HORIZONTAL_DATUM, horizontal(grid.crs).name, "reference system")
+    return replace(image, palette=None), grid, tuple(record.statements)
 
 
 def _values(image: RasterImage, grid: MapGrid, lon_lat: Array) -> Array:

@@ -1,5 +1,6 @@
 """All readers of files that others write, with what becomes of each statement in such a file."""
 
+from amers.services.formats import ground_masks
 from amers.services.formats.elevation.rows import TERRAIN_READERS
 from amers.services.formats.gcp.rows import POINT_READERS
 from amers.services.formats.images import georeference, scenes
@@ -12,6 +13,7 @@ from amers.services.formats.sensor_models import (
     rpc_text,
     worldview_isd,
 )
+from amers.services.formats.vector import map_layers
 
 READERS: tuple[Reader, ...] = (
     *POINT_READERS,
@@ -26,6 +28,8 @@ READERS: tuple[Reader, ...] = (
     georeference.AUX_READER,
     georeference.WORLD_FILE_READER,
     *TERRAIN_READERS,
+    map_layers.READER,
+    ground_masks.READER,
 )
 """In the order of `docs/inputs.md`."""
 

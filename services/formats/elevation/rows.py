@@ -67,9 +67,7 @@ GRID_READER = Reader(
         Treatment(Subject.HORIZONTAL_DATUM, "used", "of the format, the header or the `.prj` beside"),
         Treatment(Subject.HORIZONTAL_DATUM, "refused", "none; one without a usable transformation"),
         Treatment(Subject.VERTICAL_DATUM, "used", "as the caller states it"),
-        Treatment(
-            Subject.VERTICAL_DATUM, "assumed", "EGM96 in `.hgt` and DTED, whose documents say so"
-        ),
+        Treatment(Subject.VERTICAL_DATUM, "assumed", "EGM96 in `.hgt` and DTED, whose documents say so"),
         Treatment(Subject.VERTICAL_DATUM, "refused", "none, in the other formats"),
         Treatment(Subject.UNIT, "used", "of the format, or of the `.aux.xml` beside"),
         Treatment(Subject.UNIT, "assumed", "metres"),
@@ -104,9 +102,7 @@ GEOID_READER = Reader(
         Treatment(
             Subject.VERTICAL_DATUM, "used", "by its path, or its name alone where PROJ keeps its grids"
         ),
-        Treatment(
-            Subject.VERTICAL_DATUM, "named", "a national datum of heights, above a global geoid"
-        ),
+        Treatment(Subject.VERTICAL_DATUM, "named", "a national datum of heights, above a global geoid"),
         Treatment(
             Subject.VERTICAL_DATUM,
             "refused",

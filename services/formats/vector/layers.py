@@ -8,9 +8,10 @@
 | FlatGeobuf | `.fgb` | all types |
 """
 
+import sqlite3
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,7 +25,7 @@ import shapely
 
 from amers.services.errors import FormatError, InputError
 from amers.services.formats.vector.plain_geojson import plain_geojson
-from amers.services.statements import Statements
+from amers.services.statements import Statement, Statements, Subject, Use
 from amers.services.types import IntArray
 
 DRIVERS = {
@@ -150,14 +151,44 @@ def read_layer(path: Path, name: str | None = None) -> VectorLayer:
         row, why = min(unusable.items())
         raise FormatError(f"{path}: no feature can be used; feature {row + 1}: {why}")
     attributes = [number for number in range(1, table.num_columns) if number != at]
+    taken = name or with_geometries[0]
     return VectorLayer(
-        name or with_geometries[0],
+        taken,
         geometries,
         table.select(attributes),
         meta["crs"] if is_known else None,
         table.column(0).to_numpy() if driver == "GPKG" else None,
         unusable,
+        _statements(path, driver, taken, list(layers)),
     )
+
+
+def _statements(path: Path, driver: str, taken: str, layers: list[str]) -> Statements:
+    """What a file states beside the layer that is read."""
+    others = [layer for layer in layers if layer not in (taken, "layer_styles")]
+    found = []
+    if others:
+        shown = ", ".join(others)[:200]
+        found.append(Statement(path.name, Subject.IDENTITY, Use.NOT_USED, shown, "other layers"))
+    epoch = _epoch(path, taken) if driver == "GPKG" else None
+    if epoch is not None:
+        note = "its reference system is taken at its own epoch"
+        found.append(Statement(path.name, Subject.EPOCH, Use.NOT_USED, f"{epoch:g}", "", note))
+    return tuple(found)
+
+
+def _epoch(path: Path, layer: str) -> float | None:
+    """The coordinate epoch of a layer of a GeoPackage, in a column that GDAL adds to its systems."""
+    query = (
+        "SELECT s.epoch FROM gpkg_spatial_ref_sys s "
+        "JOIN gpkg_geometry_columns g ON g.srs_id = s.srs_id WHERE g.table_name = ?"
+    )
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as file:
+            row = file.execute(query, (layer,)).fetchone()
+    except sqlite3.Error:
+        return None
+    return float(row[0]) if row and isinstance(row[0], (int, float)) else None
 
 
 def _geometry_column(table: pa.Table, name: str) -> int:
