@@ -8,7 +8,13 @@ from pathlib import Path
 from amers.app.errors import InputError
 from amers.app.usecases.registration.control_sources import ControlSet
 from amers.app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
-from amers.services.formats.images.raster import RasterImage, map_grid_of, open_raster
+from amers.services.formats.images.map_statements import map_statements, unused_heights
+from amers.services.formats.images.raster import (
+    RasterImage,
+    map_grid_of,
+    open_raster,
+    shift_of_grid,
+)
 from amers.services.imagery.scene import Scene
 from amers.services.map_grid import MapGrid
 from amers.services.matching.reference_image import Reference
@@ -128,6 +134,7 @@ def read_reference(files: ReferenceFiles) -> Reference:
         InputError: the image has no coordinate reference system, or the terrain cannot be used.
     """
     image, grid = _on_map(files.image)
+    shift = shift_of_grid(image, grid)
     model = OrthoModel(grid)
     gsd_m = grid.gsd_m
     terrain = None
@@ -143,9 +150,15 @@ def read_reference(files: ReferenceFiles) -> Reference:
         height_sigma_m=height_sigma_m,
         common_sigma_m=COMMON_SIGMA_PX * gsd_m,
         frame=Frame.from_sigmas(
-            *(math.nan if sigma_m is None else sigma_m for sigma_m in (files.sigma_m, files.sigma_up_m))
+            math.nan if files.sigma_m is None else math.hypot(files.sigma_m, shift.sigma_m),
+            math.nan if files.sigma_up_m is None else files.sigma_up_m,
         ),
-        statements=image.statements + (() if terrain is None else terrain.statements),
+        statements=(
+            *image.statements,
+            *map_statements(image, grid, shift),
+            *unused_heights(image, grid),
+            *(() if terrain is None else terrain.statements),
+        ),
     )
 
 
