@@ -4,6 +4,7 @@ GDAL's order: `.aux.xml`, the image itself, the world file. GDAL does not read a
 other programs do, and it is used where nothing else states the reference system.
 """
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -111,6 +112,7 @@ def georeference(path: FilePlace, dataset: rasterio.DatasetReader) -> Georeferen
     own = Georeference(dataset.crs, dataset.transform)
     if not isinstance(path, Path):
         return own
+    path = path.resolve()
     found = [
         (file, part)
         for file, part in (_of_aux(path), _world_file(path, dataset.driver))
@@ -150,8 +152,8 @@ def _said(file: Path, where: str, use: Use, value: str = "map grid", note: str =
 
 def _of_aux(path: Path) -> tuple[Path, Georeference | None]:
     """The map grid in the `.aux.xml` of an image, if any."""
-    file = path.resolve().with_name(f"{path.resolve().name}.aux.xml")
-    if not file.is_file():
+    file = Path(f"{path}.aux.xml")
+    if not os.path.isfile(file):
         return file, None
     root = parse_xml(read_text(file), file.name)
     text, wkt = root.findtext("GeoTransform"), (root.findtext("SRS") or "").strip()
@@ -167,10 +169,11 @@ def _of_aux(path: Path) -> tuple[Path, Georeference | None]:
 
 def _world_file(path: Path, driver: str) -> tuple[Path, Georeference | None]:
     """The geotransform in the world file of an image; it counts from the centre of the first pixel."""
-    path = path.resolve()
+    stem = os.path.splitext(path)[0]
     for suffix in _WORLD_FILES.get(driver, ()):
-        for file in (path.with_suffix(suffix), path.with_suffix(suffix.upper())):
-            if file.is_file():
+        for name in (stem + suffix, stem + suffix.upper()):
+            if os.path.isfile(name):
+                file = Path(name)
                 words = read_text(file).split()
                 if len(words) != 6:
                     raise FormatError(
@@ -184,7 +187,6 @@ def _world_file(path: Path, driver: str) -> tuple[Path, Georeference | None]:
 
 def _prj(path: Path) -> tuple[Path, CRS | None]:
     """The reference system in the `.prj` beside an image, if any."""
-    path = path.resolve()
     for file in (path.with_suffix(".prj"), path.with_suffix(".PRJ")):
         if file.is_file():
             return file, _crs(read_text(file).strip(), file)

@@ -96,15 +96,13 @@ def has_model(path: FilePlace) -> bool:
     return root.tag == "PHR_Dimap_Document" or any(root.find(f".//{tag}") is not None for tag in models)
 
 
-def tagged_model(dataset: rasterio.DatasetReader, path: FilePlace) -> FoundModel | None:
-    """The RPC in the tags of a GeoTIFF, or the RPC00B or RPC00A of a NITF; None without one.
+def tagged_model(dataset: rasterio.DatasetReader, path: FilePlace) -> FoundModel:
+    """The RPC in the tags of a GeoTIFF, or the RPC00B or RPC00A of a NITF.
 
     Raises:
         FormatError: a number is missing or is none.
     """
     tags = dataset.tags(ns="RPC")
-    if not tags:
-        return None
     records = dataset.tags(ns="TRE")
     if "RPC00A" in records and "RPC00B" not in records:
         tags = {**tags, **_rpc00a_coefficients(records["RPC00A"])}

@@ -86,19 +86,14 @@ def model_sources(image: SceneImage, siblings: Siblings) -> Iterator[ModelSource
     is_found = False
     for kind in ORDER.get(image.dataset.driver, ORDER["GTiff"]):
         if kind == "tags":
-            tagged = None if isinstance(image, TiledImage) else tagged_model(image.dataset, image.path)
-            if tagged is not None:
+            if not isinstance(image, TiledImage) and image.dataset.tags(ns="RPC"):
                 is_found = True
-                yield ModelSource(kind, image.path, partial(_itself, tagged))
+                yield ModelSource(kind, image.path, partial(tagged_model, image.dataset, image.path))
         elif kind != "rigorous" or not is_found:
             for file in siblings.named(names[kind]):
                 if has_model(file):
                     is_found = True
                     yield ModelSource(kind, file, partial(read_model_file, file))
-
-
-def _itself(found: FoundModel) -> FoundModel:
-    return found
 
 
 def names_of_models(image: SceneImage) -> dict[str, list[str]]:
