@@ -164,7 +164,10 @@ class WorkOptions:
 def register(
     context: typer.Context,
     scenes: Annotated[
-        list[Path], typer.Argument(help="GeoTIFF, JPEG 2000 or NITF, or folders of such images.")
+        list[Path],
+        typer.Argument(
+            help="GeoTIFF, JPEG 2000, NITF, DIM_….XML or .TIL of tiles, or folders of these."
+        ),
     ],
     *,
     control: ControlOptions,

@@ -20,7 +20,12 @@ Options = Annotated[OrthoOptions, Shown(tolerance_px=typer.Option(min=1e-4), hid
 
 
 def ortho(
-    scene: Annotated[Path, typer.Argument(exists=True, help="GeoTIFF, JPEG 2000 or NITF.")],
+    scene: Annotated[
+        Path,
+        typer.Argument(
+            exists=True, help="GeoTIFF, JPEG 2000, NITF, or DIM_….XML, .TIL or folder of tiles."
+        ),
+    ],
     *,
     terrain: Terrain,
     output: Annotated[Path, typer.Option("-o", "--output", help="GeoTIFF to write.")],

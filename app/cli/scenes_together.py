@@ -43,7 +43,10 @@ class JointOptions:
 def register_many(
     context: typer.Context,
     scenes: Annotated[
-        list[Path], typer.Argument(help="GeoTIFF, JPEG 2000 or NITF, or folders of such images.")
+        list[Path],
+        typer.Argument(
+            help="GeoTIFF, JPEG 2000, NITF, DIM_….XML or .TIL of tiles, or folders of these."
+        ),
     ],
     *,
     models: ModelChoice,

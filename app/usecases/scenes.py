@@ -25,7 +25,8 @@ from amers.app.usecases.installation import Installation
 from amers.app.usecases.server_files import file_below
 from amers.services.errors import FormatError
 from amers.services.formats.images.signatures import DRIVER_OF_SIGNATURE
-from amers.services.formats.sensor_models.product_image import whole_product
+from amers.services.formats.sensor_models.product_documents import is_document, read_product
+from amers.services.formats.sensor_models.product_image import tile_file, whole_product
 
 LONGEST_NAME = 120
 LONGEST_SIGNATURE = max(len(signature) for signature in DRIVER_OF_SIGNATURE)
@@ -246,7 +247,7 @@ def add_server_scene(
 
 
 def server_image(settings: Settings, path: str) -> Path:
-    """The image of a scene below AMERS_SCENE_FOLDER.
+    """The image of a scene below AMERS_SCENE_FOLDER, or the document of a product in tiles.
 
     Raises:
         InputError: AMERS_SCENE_FOLDER is not set, or has no such image.
@@ -257,7 +258,10 @@ def server_image(settings: Settings, path: str) -> Path:
             "upload the image instead"
         )
     image = file_below(settings.scene_folder, path, "path", "AMERS_SCENE_FOLDER")
-    with image.open("rb") as file:
+    first = tile_file(read_product(image)[0]) if is_document(image) else image
+    if not isinstance(first, Path) or not first.is_file():
+        raise InputError(f"path: {image.name} lists {first.name}, which is not beside it")
+    with first.open("rb") as file:
         require_image_signature(file.read(LONGEST_SIGNATURE))
     return image
 

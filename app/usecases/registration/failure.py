@@ -12,6 +12,7 @@ from amers.app.outages import outage_of
 from amers.app.usecases.registration.control_sources import ControlSet
 from amers.app.usecases.report_files import write_report
 from amers.services.errors import AmersError, CoverageError
+from amers.services.formats.images.scenes import scene_name
 from amers.services.imagery.scene import Scene
 from amers.services.registration.context import SearchStage
 from amers.services.registration.options import RegistrationOptions
@@ -86,7 +87,7 @@ def write_failure(folder: Path, attempt: Attempt, error: Exception) -> None:
 
 
 def _failure_report(attempt: Attempt, error: Exception) -> FailureReport:
-    name, scene = attempt.image.stem, attempt.scene
+    name, scene = scene_name(attempt.image), attempt.scene
     record = UnreadScene(name) if scene is None else scene_record(scene, name)
     stages, reason = tuple(attempt.stages), str(error)
     if not isinstance(error, AmersError):
