@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from amers.app.cli.options import FromMilli, option_name
+from amers.app.cli.options import FromMilli, GeoidFile, option_name
 from amers.app.cli.point_statements import sigma_pair, stated_by_caller
 from amers.app.errors import InputError
 from amers.app.usecases.control_files import ControlFiles, HeightFile
@@ -44,7 +44,7 @@ class ControlOptions:
     control_frame_sigma_m: str | None = None
     control_mark_sigma_px: FromMilli = None
     control_vertical: str | None = None
-    control_geoid: Path | None = None
+    control_geoid: GeoidFile = None
     control_crs: str | None = None
     control_columns: str | None = None
     control_sigma_axes: str | None = None
@@ -52,7 +52,7 @@ class ControlOptions:
     control_ortho_sigma_m: FromMilli = None
     control_dem: Path | None = None
     control_dem_vertical: str | None = None
-    control_dem_geoid: Path | None = None
+    control_dem_geoid: GeoidFile = None
     control_dem_sigma_m: FromMilli = None
     control_dem_frame_sigma_m: str | None = None
 

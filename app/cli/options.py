@@ -23,6 +23,10 @@ FromCenti = Annotated[float | None, typer.Option(min=0.01)]
 """A positive number, 0.01 at least: a length in metres."""
 
 
+GeoidFile = Annotated[Path | None, typer.Option()]
+"""A grid file of a geoid: by its path, or its name alone where PROJ keeps its grids."""
+
+
 class Shown(dict[str, OptionInfo | ArgumentInfo | None]):
     """The fields of a dataclass that a command has options for, in the order of its help.
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from amers.app.cli.options import Shown
+from amers.app.cli.options import GeoidFile, Shown
 from amers.app.cli.output import AsJson, show_one
 from amers.app.cli.point_statements import sigma_pair, stated_by_caller
 from amers.app.cli.production_rows import accuracy_row, agreement_row, sampling_pair
@@ -50,14 +50,14 @@ class StatementOptions:
     """
 
     vertical: str | None = None
-    geoid: Path | None = None
+    geoid: GeoidFile = None
     crs: str | None = None
     columns: str | None = None
     sigma_axes: str | None = None
     point_sigma_m: str | None = None
     dem: Path | None = None
     dem_vertical: str | None = None
-    dem_geoid: Path | None = None
+    dem_geoid: GeoidFile = None
 
     @property
     def terrain(self) -> TerrainFile | None:

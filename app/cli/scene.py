@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from amers.app.cli.options import FromMilli, words_of
+from amers.app.cli.options import FromMilli, GeoidFile, words_of
 from amers.app.cli.output import AsJson
 from amers.app.cli.scene_registration import (
     Control,
@@ -41,7 +41,7 @@ class ControlOptions:
         reference: ortho-image to register on; with --block only where it has no points.
         dem: heights of the reference's ground: a file, or a folder or .txt list of tiles.
         vertical: vertical datum of these heights: ellipsoid, EGM96, EPSG:…
-        geoid: grid file of the geoid, GTX or GeoTIFF.
+        geoid: grid file of the geoid, GTX or GeoTIFF; also its name among PROJ's grids.
         reference_sigma_m: accuracy of the reference on the Earth, one sigma, metres.
         reference_sigma_up_m: accuracy of its heights on the Earth, one sigma, metres.
     """
@@ -50,7 +50,7 @@ class ControlOptions:
     reference: Path | None = None
     dem: Path | None = None
     vertical: str | None = None
-    geoid: Path | None = None
+    geoid: GeoidFile = None
     reference_sigma_m: FromMilli = None
     reference_sigma_up_m: FromMilli = None
 

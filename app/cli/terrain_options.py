@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from amers.app.cli.options import Shown
+from amers.app.cli.options import GeoidFile, Shown
 from amers.app.usecases.terrain_file import TerrainFile
 
 
@@ -17,12 +17,12 @@ class TerrainOptions:
     Attributes:
         dem: heights of the ground: GeoTIFF, .hgt, .bil, .asc, VRT …, a folder or .txt list of them.
         vertical: vertical datum of the heights: ellipsoid, EGM96, EGM2008, EPSG:…
-        geoid: grid file of the geoid, GTX or GeoTIFF.
+        geoid: grid file of the geoid, GTX or GeoTIFF; also its name among PROJ's grids.
     """
 
     dem: Path | None = None
     vertical: str | None = None
-    geoid: Path | None = None
+    geoid: GeoidFile = None
 
     @property
     def terrain(self) -> TerrainFile | None:
@@ -32,6 +32,11 @@ class TerrainOptions:
 
 Terrain = Annotated[
     TerrainFile,
-    Shown(dem=typer.Option(exists=True), vertical=None, geoid=None, fill_px=typer.Option(min=0, max=50)),
+    Shown(
+        dem=typer.Option(exists=True),
+        vertical=None,
+        geoid=typer.Option(),
+        fill_px=typer.Option(min=0, max=50),
+    ),
 ]
 """A terrain without which a command does nothing."""
