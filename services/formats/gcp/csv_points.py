@@ -322,6 +322,10 @@ def _crs(columns: _Columns, comments: Comments, layout: CsvLayout, record: Recor
             f"and {layout.crs}; leave --crs out"
         )
     crs = of_caller or comments.crs
+    if crs is not None and len(crs.axis_info) > 2:
+        vertical = crs.sub_crs_list[1].name if crs.is_compound else "the ellipsoid"
+        note = "the datum of heights is that of --vertical or of their column"
+        record.not_used(Subject.VERTICAL_DATUM, vertical, "reference system", note)
     if columns.on_map:
         return crs if crs is None else crs.to_2d()
     if crs is None:

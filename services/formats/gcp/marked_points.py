@@ -180,6 +180,11 @@ def to_wgs84(
     height = coordinates[:, 2]
     flat = np.column_stack([coordinates[:, :2], np.nan_to_num(height, nan=0.0)])
     in_space = len(crs.axis_info) >= 3 and not crs.is_compound
+    if in_space and heights not in (None, ELLIPSOID):
+        raise VerticalDatumError(
+            f"{source}: {crs.name} has heights above its ellipsoid, the caller states {heights}; omit "
+            "the datum of the heights, or give a reference system without heights"
+        )
     if in_space and not crs.is_geographic and not crs.is_projected:
         ground = _transformed(flat, crs, source, axes_of_crs)
         return Ground(ground, 0.0, _of_three_axes(crs, source))
