@@ -20,7 +20,7 @@ AmersError
 Every message states the values found and expected.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 
 class AmersError(Exception):
@@ -47,6 +47,13 @@ class MissingStatements(InputError):
         several = f"{len(missing)} statements are missing: {sentences}"
         super().__init__(several if len(missing) > 1 else missing[0])
         self.missing = tuple(missing)
+
+
+def reword(error: InputError, change: Callable[[str], str]) -> None:
+    """Change the message of an error, such as the names of options in it."""
+    error.args = (change(str(error)),)
+    if isinstance(error, MissingStatements):
+        error.missing = tuple(change(text) for text in error.missing)
 
 
 def refuse_unstated(missing: Sequence[InputError]) -> None:

@@ -115,6 +115,40 @@ def test_accuracy_and_datum_are_never_invented(tmp_path, unstated, error, messag
         read_marked(written(tmp_path, CSV), replace(STATED, **unstated), scenes(), IMAGES)
 
 
+def test_everything_that_nobody_states_is_named_at_once_in_the_order_of_the_options(tmp_path) -> None:
+    text = CSV.replace("lon,lat", "x,y").replace("# pixel-origin=corner\n", "")
+    nothing = PointStatements(StatedByCaller(options="--control-"))
+    with pytest.raises(InputError) as refused:
+        read_marked(written(tmp_path, text), nothing, scenes(), IMAGES)
+    options = ["--control-vertical", "--control-crs", "pixel-origin"]
+    places = [str(refused.value).find(option) for option in options]
+    assert -1 < places[0] < places[1] < places[2]
+    with pytest.raises(InputError) as refused:
+        read_marked(written(tmp_path, CSV), nothing, scenes(), IMAGES)
+    options = ["--control-sigma-m", "--control-frame-sigma-m", "--control-vertical"]
+    places = [str(refused.value).find(option) for option in options]
+    assert -1 < places[0] < places[1] < places[2]
+    assert str(refused.value).startswith("3 statements are missing: (1) ")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("50,60", "5000,4500", r"1 of 3 marks lie outside\); these are coordinates of a map"),
+        ("10.002,45.002", "43.621,5.382", r"seem exchanged: none of 3 points .* 1 do with both"),
+    ],
+)
+def test_marks_and_points_of_elsewhere_are_refused_at_once(tmp_path, old, new, message) -> None:
+    with pytest.raises(InputError, match=message):
+        read_marked(written(tmp_path, CSV.replace(old, new)), STATED, scenes(), IMAGES)
+
+
+def test_images_with_paths_are_matched_by_their_file_names(tmp_path: Path) -> None:
+    text = CSV.replace("one.tif", "C:\\work\\ONE.TIF").replace("two", "/home/user/two.tif")
+    marked = read_marked(written(tmp_path, text), STATED, scenes(), IMAGES)
+    assert marked.marks.image.tolist() == [0, 1, 1]
+
+
 def test_marks_without_an_origin_of_pixels_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="pixel-origin"):
         read_marked(

@@ -1,11 +1,13 @@
 """Read the check points of a scene: known ground marked in it, and held out of its registration."""
 
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from amers.app.errors import InputError
+from amers.services.errors import reword
 from amers.services.formats.gcp.marked_points import MarkedPoints
 from amers.services.formats.gcp.reader import read_control_points
 from amers.services.imagery.marks import check_marks_inside, check_not_exchanged
@@ -14,8 +16,13 @@ from amers.services.quality.check_points import CheckPoints
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.types import Array
 
-_GRID = ", or the grid file of a geoid (--geoid)"
-_OF_HEIGHTS = re.compile(r"--vertical and --geoid|--vertical|--geoid")
+_OPTIONS = (
+    (r", or the grid file of a geoid \(--geoid\)", ""),
+    (r"state it \(--crs\), such as EPSG:32633, or in", "state it in"),
+    (r"name (it|them|the one to use) \(--columns [^)]*\)", "rename its column"),
+    (r"--vertical and --geoid|--vertical|--geoid", "--check-heights"),
+)
+"""Options that commands on check points do not have, and what a message says in their place."""
 
 
 def read_check_points(path: Path, heights: str | None, image: Path, scene: Scene) -> CheckPoints:
@@ -54,7 +61,8 @@ def marks_of_scene(path: Path, heights: str | None, image: Path, scene: Scene) -
     try:
         marks = read_control_points(path, heights)
     except InputError as error:
-        error.args = (_OF_HEIGHTS.sub("--check-heights", str(error).replace(_GRID, "")),)
+        for option, instead in _OPTIONS:
+            reword(error, partial(re.sub, option, instead))
         raise
     names = np.char.lower(marks.image)
     is_in_scene = np.isin(names, ["", image.name.lower(), image.stem.lower()])

@@ -14,7 +14,7 @@ from amers.services.formats.gcp.record import Record
 from amers.services.statements import Statements, Subject
 from amers.services.types import Array
 
-_KEY = r"wkt|crs|srs|proj4?|projection|coordinate system|(?:coordinate |spatial )?reference(?: system)?"
+_KEY = r"wkt|crs|srs|proj4?|projection|coordinate ?system|(?:coordinate |spatial )?reference(?: system)?"
 _CRS = re.compile(
     rf"\bcrs=(?P<token>\S+)|^(?:{_KEY})\s*[:=]\s*(?P<rest>\S.*)$|(?P<code>\bEPSG:\d+(?:\+\d+)?)"
     r"|^(?P<wkt>(?:GEOGCS|PROJCS|COMPD_CS|GEO[DG]CRS|PROJCRS|COMPOUNDCRS|BOUNDCRS)\[.*)$"

@@ -100,7 +100,8 @@ def read_head(text: str) -> Head:
     if subject is Subject.ACCURACY:
         return Head(text, subject=subject)
     for name, synonyms in _POSITION.items():
-        if synonyms & set(rest) and set(rest) <= synonyms | _FILLER:
+        others = _FILLER | ({"x", "y"} if name in ("lon", "lat") else set())
+        if synonyms & set(rest) and set(rest) <= synonyms | others:
             return Head(text, name, of_unit_m)
     height = _height(text, rest, of_unit_m)
     if height is not None:

@@ -56,7 +56,8 @@ COLUMNS = [
     "sigma_px",
 ]
 """Names of the columns. x and y, easting first, replace lon and lat in another reference system;
-`sigma_horizontal_m` stands for both horizontal coordinates. Other columns are ignored."""
+`sigma_horizontal_m` stands for both horizontal coordinates. Words of surveyors are understood, too, see
+`read_head`. Other columns are named as not used."""
 PIXEL_ORIGINS = {"centre": 0.0, "corner": 0.5, "centre-1": 1.0, "corner-1": 1.5}
 """Line and sample of the centre of the first pixel, by the names of conventions: the centre is (0, 0),
 the corner is (0, 0), the centre is (1, 1), the corner is (1, 1)."""

@@ -160,4 +160,4 @@ def _crs(line: str, source: str) -> CRS:
     utm = _UTM.fullmatch(line)
     if utm is not None and 1 <= int(utm[1]) <= 60:
         return CRS.from_epsg((32700 if utm[2].upper() == "S" else 32600) + int(utm[1]))
-    return earth_crs(line, source)
+    return earth_crs(line, f"{source}, first line")

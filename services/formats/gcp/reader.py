@@ -15,6 +15,7 @@ from amers.services.errors import (
     MissingStatements,
     VerticalDatumError,
     refuse_unstated,
+    reword,
 )
 from amers.services.formats.gcp.copernicus import COPERNICUS_KEY, parse_copernicus
 from amers.services.formats.gcp.csv_points import (
@@ -243,7 +244,7 @@ def _read(path: Path, stated: StatedByCaller) -> MarkedPoints:
     try:
         points = form.parse(text, stated, path.name)
     except InputError as error:
-        error.args = (_OPTION.sub(stated.options, str(error)),)
+        reword(error, lambda text: _OPTION.sub(stated.options, text))
         raise
     _refuse_heights(points, path)
     told = [replace(one, note=_OPTION.sub(stated.options, one.note)) for one in points.statements]

@@ -126,6 +126,18 @@ add(CSV_READER, Subject.UNIT, "refused", "expected metres, found ft", "lon,lat,z
 add(CSV_READER, Subject.UNIT, "used", "column unit", "lon,lat,z,unit\n12,41,100,m\n")
 add(CSV_READER, Subject.UNIT, "refused", "states feet", "# heights in feet\nlon,lat,z\n12,41,100\n")
 
+# Files of Metashape
+
+METASHAPE = (
+    '# CoordinateSystem: GEOGCS["WGS 84",DATUM["World Geodetic System 1984",'
+    'SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],'
+    'UNIT["degree",0.01745329251994328],AUTHORITY["EPSG","4326"]]\n'
+    "#Label,X/Longitude,Y/Latitude,Z/Altitude,Accuracy_(m),Error_(m),Z_est\n1,12,41,100,0.02,0.03,99\n"
+)
+add(CSV_READER, Subject.HORIZONTAL_DATUM, "used", "WGS 84", METASHAPE, height_m=100.0)
+add(CSV_READER, Subject.ACCURACY, "named", "Accuracy_(m)", METASHAPE)
+add(CSV_READER, Subject.VERTICAL_DATUM, "named", "Z_est", METASHAPE)
+
 # CSV: dialects of spreadsheets
 
 eu = "id;lon;lat;height_m\np;12,25;41,5;100,5\n"
