@@ -9,6 +9,7 @@ from pyproj import CRS, Transformer
 
 from amers.services.errors import FormatError, VerticalDatumError
 from amers.services.formats.elevation.geoid import vertical_crs
+from amers.services.formats.elevation.heights import unit_m
 from amers.services.formats.gcp.marked_points import ELLIPSOID, Heights, parse_crs
 from amers.services.formats.gcp.record import Record
 from amers.services.statements import Statements, Subject
@@ -22,7 +23,7 @@ _CRS = re.compile(
     re.IGNORECASE,
 )
 _DATUM = re.compile(
-    r"(?:--datum[ =]+|\b(?:horizontal )?datum\s*[:=]\s*)([\w-]+(?: \d+)?)", re.IGNORECASE
+    r"(?:--datum[ =]+|\b(?:horizontal )?datum\s*[:=]\s*)((?!\d)[\w-]+(?: \d+)?)", re.IGNORECASE
 )
 _DATUMS = {
     "wgs84": "EPSG:4326",
@@ -40,7 +41,7 @@ _VERTICAL = re.compile(
 _ABOVE_ELLIPSOID = re.compile(r"\bmetres above the (?:WGS ?84 )?ellipsoid", re.IGNORECASE)
 _NOT_METRES = re.compile(
     r"\b(?:units?|heights?|elevations?|altitudes?|z)\b.*?\b((?:us[ -]?)?(?:survey )?(?:feet|foot|ft)|"
-    r"us-?ft|cm|mm|centimet\w+|millimet\w+|yards?|inch\w*)\b",
+    r"us-?ft|cm|mm|centimet(?:er|re)s?|millimet(?:er|re)s?|yards?|fathoms?)\b",
     re.IGNORECASE,
 )
 _NAMED = {
@@ -75,16 +76,19 @@ def comment_lines(text: str, prefix: str) -> Iterator[tuple[int, str]]:
             yield count, line.strip().lstrip(prefix).strip()
 
 
-def read_comments(lines: Iterable[tuple[int, str]], source: str) -> Comments:
+def read_comments(
+    lines: Iterable[tuple[int, str]], source: str, heights_unit_m: float = 1.0
+) -> Comments:
     """The reference system and the datum of heights that comments state.
 
     Args:
         lines: number and content of each comment.
         source: name of the file, for messages.
+        heights_unit_m: metres of the unit that the heights of the file have.
 
     Raises:
         FormatError: a reference system is not understood or not one of the Earth, two differ, or
-            heights are in another unit than metres.
+            heights are stated in another unit than theirs.
         VerticalDatumError: two datums of heights differ.
     """
     crs: CRS | None = None
@@ -93,10 +97,12 @@ def read_comments(lines: Iterable[tuple[int, str]], source: str) -> Comments:
     for count, line in lines:
         where = f"line {count}"
         unit = _NOT_METRES.search(line)
-        if unit is not None:
+        if unit is not None and abs(unit_m(unit[1], source, where) / heights_unit_m - 1.0) < 1e-5:
+            record.used(Subject.UNIT, unit[1], where)
+        elif unit is not None:
             raise FormatError(
-                f"{source}, {where}: {line[:80]!r} states {unit[1]}, but this format has metres; "
-                "convert the heights to metres and correct the comment"
+                f"{source}, {where}: {line[:80]!r} states {unit[1]}, but heights are read in "
+                f"units of {heights_unit_m:.6g} m here; convert them and correct the comment"
             )
         vertical = _vertical(line, f"{source}, {where}")
         definition = _definition(line) if vertical is None or _CRS.search(line) else None

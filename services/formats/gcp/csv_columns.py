@@ -21,6 +21,9 @@ _HEIGHT = _words("height heights hgt h z alt altitude elev elevation elevations 
 _LOOKS_LIKE_HEIGHT = re.compile(
     r"height|hgt|elev|altit|orthom|ellipsh|höhe|hoehe|hauteur|cota|cote|quota|altura|altez|depth|niveau"
 )
+_MAYBE_HEIGHT = _words("up u rl ht el dtm dem dsm")
+_SYSTEM = re.compile(r"\w*datum|\w?crs|\w?srs|epsg\w*|srid|projection|(?:utm)?zone")
+_OF_HEIGHTS = re.compile(r"vert|vdatum|vcrs|height|elev|geoid")
 _ELLIPSOID = _words("ell ellip ellips ellipsoid ellipsoidal ellipsoidic hae wgs84")
 _SEA = _words("ortho orthometric msl amsl asl sea")
 _GEOIDS = {"egm84": "EGM84", "egm96": "EGM96", "egm2008": "EGM2008", "egm08": "EGM2008"}
@@ -74,6 +77,8 @@ class Head:
         datum: of a height: "ellipsoid", a geoid, or `ABOVE_SEA`; None where the head states none.
         subject: what the column states, where it is not read.
         looks_like_height: whether a column that is not read may have heights.
+        states: what the values of a column state of the others: a unit, a vertical datum, a reference
+            system; None for nothing.
     """
 
     text: str
@@ -82,6 +87,7 @@ class Head:
     datum: str | None = None
     subject: Subject = Subject.IDENTITY
     looks_like_height: bool = False
+    states: Subject | None = None
 
 
 def read_head(text: str) -> Head:
@@ -103,14 +109,29 @@ def read_head(text: str) -> Head:
         others = _FILLER | ({"x", "y"} if name in ("lon", "lat") else set())
         if synonyms & set(rest) and set(rest) <= synonyms | others:
             return Head(text, name, of_unit_m)
+    states = _states(words)
+    if states is not None:
+        return Head(text, subject=states, states=states)
     height = _height(text, rest, of_unit_m)
     if height is not None:
         return height
-    is_like = bool(_HEIGHT & set(words)) or _LOOKS_LIKE_HEIGHT.search(joined) is not None
+    is_like = (
+        bool((_HEIGHT | _MAYBE_HEIGHT) & set(words)) or _LOOKS_LIKE_HEIGHT.search(joined) is not None
+    )
     is_like &= not _UNDULATION & set(words)
     if subject is None and is_like:
         subject = Subject.VERTICAL_DATUM
     return Head(text, subject=subject or Subject.IDENTITY, looks_like_height=is_like)
+
+
+def _states(words: list[str]) -> Subject | None:
+    """What the values of a column state of the others, by the words of its head."""
+    if {"unit", "units", "uom"} & set(words):
+        return Subject.UNIT
+    if {"above", "over"} & set(words) or not any(map(_SYSTEM.fullmatch, words)):
+        return None
+    is_vertical = any(_OF_HEIGHTS.match(word) or word in _HEIGHT for word in words)
+    return Subject.VERTICAL_DATUM if is_vertical else Subject.HORIZONTAL_DATUM
 
 
 def _unit(words: list[str]) -> tuple[float | None, list[str]]:

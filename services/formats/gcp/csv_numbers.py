@@ -44,6 +44,7 @@ def parse_field(field: str, name: str, where: str, *, comma: bool) -> float:
             )
         field = field.replace(",", ".")
     if name in _PLACES and re.fullmatch(NUMBER_PATTERN, field) is None:
+        field = field if "." in field else field.replace(",", ".")
         return _angle(field, name, where)
     return parse_number(field, name, where)
 

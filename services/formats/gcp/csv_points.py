@@ -23,6 +23,7 @@ from amers.services.formats.gcp.comments import (
 )
 from amers.services.formats.gcp.csv_columns import ABOVE_SEA, Head, chosen_height, read_head
 from amers.services.formats.gcp.csv_numbers import has_decimal_comma, parse_field
+from amers.services.formats.gcp.csv_statements import TakenAs, record_unused
 from amers.services.formats.gcp.csv_table import CsvHead, CsvRow, csv_head, csv_rows
 from amers.services.formats.gcp.marked_points import (
     ELLIPSOID,
@@ -65,14 +66,7 @@ _ORIGIN = re.compile(r"\bpixel-origin\s*[=:]\s*(\S+)", re.IGNORECASE)
 """What a line before the names may state: `# pixel-origin=corner crs=EPSG:32633 heights=EGM96`."""
 _POSITIONS = ({"lon", "lat"}, {"x", "y"})
 _POSITION_NAMES = ("lon", "lat", "x", "y")
-_WGS84 = CRS.from_epsg(4326)
-_STATEMENT = re.compile(
-    r"(units?|uom|heightunits?)|(vdatum|verticaldatum|heightdatum|vcrs|geoidmodel)|"
-    r"(?:h?datum|horizontaldatum|crs|srs|epsg|epsgcode|srid|projection|zone|utmzone|ellipsoid)"
-)
-"""Columns whose values state a unit, a vertical datum, or a reference system."""
 _FLAGS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
-_EARTH = {"wgs84", "wgs 84", "wgs_84", "wgs-84", "4326", "epsg:4326", "4979", "epsg:4979"}
 
 
 @dataclass(frozen=True)
@@ -161,7 +155,8 @@ def parse_csv(
     if sigmas:
         record.used(Subject.ACCURACY, sigmas, "columns")
     active, check = (_flags(rows, columns, name, record) for name in ("active", "check"))
-    _record_unused(rows, columns, datum, crs, record, is_stated=layout.crs is not None)
+    taken = TakenAs(str(datum), crs, is_stated=columns.on_map or layout.crs is not None)
+    record_unused(rows, columns.unused, taken, record)
     _check_units(columns, crs, record)
     points = _ground(numbers, columns, crs, datum, rows)
     corner_px = _corner_px(columns, head, record)
@@ -353,43 +348,6 @@ def _flags(rows: list[CsvRow], columns: _Columns, name: str, record: Record) -> 
     flags = np.array([_FLAGS[field] for field in fields], dtype=np.bool_)
     record.used(Subject.VALIDITY, f"{int(flags.sum())} of {len(flags)}", where)
     return flags
-
-
-def _record_unused(
-    rows: list[CsvRow],
-    columns: _Columns,
-    datum: Heights | None,
-    crs: CRS,
-    record: Record,
-    *,
-    is_stated: bool,
-) -> None:
-    """Note the columns that are not read; refuse those whose statement would change the result."""
-    for place, head in columns.unused:
-        values = sorted({row.fields[place] for row in rows})
-        shown = ", ".join(values[:3])[:80]
-        where = f"column {head.text}"
-        statement = _STATEMENT.fullmatch(re.sub(r"[\W_]+", "", head.text.lower()))
-        if statement is None or not any(values):
-            record.not_used(head.subject, shown, where)
-        elif statement[1]:
-            if not {value.lower() for value in values} <= {"m", "metre", "metres", "meter", "meters"}:
-                raise FormatError(
-                    f"{columns.source}, {where}: expected metres, found {shown}; state the unit in the "
-                    "name of the column of heights, such as height_ft"
-                )
-            record.used(Subject.UNIT, shown, where)
-        elif statement[2]:
-            record.not_used(Subject.VERTICAL_DATUM, shown, where, f"heights above {datum}")
-        elif {value.lower() for value in values} <= _EARTH and not columns.on_map and crs == _WGS84:
-            record.used(Subject.HORIZONTAL_DATUM, shown, where)
-        elif is_stated or columns.on_map:
-            record.not_used(Subject.HORIZONTAL_DATUM, shown, where, f"taken as {crs.name}")
-        else:
-            raise FormatError(
-                f"{columns.source}, {where}: expected WGS 84 of lon and lat, found {shown}; state the "
-                "reference system (--crs)"
-            )
 
 
 def _corner_px(columns: _Columns, head: CsvHead, record: Record) -> float:

@@ -87,13 +87,19 @@ def parse_gcp_list(
     if not lines:
         raise FormatError(f"{source}: expected a reference system in the first line, found nothing")
     crs = _crs(lines[0][1], source)
-    comments = read_comments(comment_lines(text, "#"), source)
+    unit_m = (
+        horizontal_unit_m(crs) if len(crs.axis_info) < 3 else crs.axis_info[2].unit_conversion_factor
+    )
+    comments = read_comments(comment_lines(text, "#"), source, unit_m)
     if comments.crs is not None and comments.crs != crs:
         raise FormatError(
             f"{source}: {comments.crs.name} stated in a comment, {crs.name} in the first line; expected "
             "one reference system: remove the comment, or correct the first line"
         )
     record = Record(source, list(comments.statements))
+    zone = _UTM.fullmatch(lines[0][1])
+    if zone is not None and not zone[2]:
+        record.assumed(Subject.HORIZONTAL_DATUM, f"{crs.name}, the northern one", "first line")
     ids, coordinates, pixels, images = [], [], [], []
     unnamed: dict[tuple[str, ...], str] = {}
     for where, line in lines[1:]:

@@ -130,10 +130,13 @@ ODM_READER = Reader(
         Treatment(
             Subject.HORIZONTAL_DATUM, "used", "first line: code, PROJ string, `WGS84 UTM 31N`, WKT"
         ),
+        Treatment(
+            Subject.HORIZONTAL_DATUM, "assumed", "the northern zone, of `WGS84 UTM 31` without N or S"
+        ),
         _OTHER_BODY,
         Treatment(Subject.VERTICAL_DATUM, "used", "of a reference system with heights; in a comment"),
         _NO_DATUM,
-        Treatment(Subject.UNIT, "used", "of a reference system with heights"),
+        Treatment(Subject.UNIT, "used", "of a reference system with heights; the same in a comment"),
         Treatment(Subject.UNIT, "assumed", "the unit of a projected reference system; else metres"),
         _FEET_IN_COMMENT,
         Treatment(Subject.PIXEL_ORIGIN, "assumed", "the centre of the first pixel is (0, 0)"),

@@ -126,6 +126,27 @@ add(CSV_READER, Subject.UNIT, "refused", "expected metres, found ft", "lon,lat,z
 add(CSV_READER, Subject.UNIT, "used", "column unit", "lon,lat,z,unit\n12,41,100,m\n")
 add(CSV_READER, Subject.UNIT, "refused", "states feet", "# heights in feet\nlon,lat,z\n12,41,100\n")
 
+# CSV: columns that state something of the others
+
+for column, value in (
+    ("elevation_unit", "ft"),
+    ("Z Units", "US survey feet"),
+    ("unit", "cm"),
+    ("verticalUnits", "feet"),
+):
+    text = f"lon,lat,z,{column}\n12,41,100,{value}\n"
+    add(CSV_READER, Subject.UNIT, "refused", f"expected metres, found {value}", text)
+for column in ("height_datum", "vdatum", "Vertical Datum", "verticalDatum"):
+    text = f"lon,lat,z,{column}\n12,41,100,EGM96\n"
+    add(CSV_READER, Subject.VERTICAL_DATUM, "named", "EGM96", text, height_m=100.0)
+for column in ("EPSG", "crs", "SRID", "hdatum"):
+    text = f"lon,lat,{column}\n12,41,4230\n"
+    add(CSV_READER, Subject.HORIZONTAL_DATUM, "refused", "found 4230", text)
+add(CSV_READER, Subject.EPOCH, "named", "12.05.2021", "lon,lat,Datum\n12,41,12.05.2021\n")
+for head in ("Up", "HT", "RL", "U"):
+    text = f"E,N,{head}\n275443.7,4646566.3,100\n"
+    add(CSV_READER, Subject.VERTICAL_DATUM, "refused", f"{head!r} may have", text, stated=UTM)
+
 # Files of Metashape
 
 METASHAPE = (

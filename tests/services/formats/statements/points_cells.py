@@ -167,6 +167,9 @@ add(ODM_READER, Subject.UNIT, "used", "metre", in_space, stated=NOBODY)
 add(ODM_READER, Subject.UNIT, "assumed", "metre", ODM, height_m=100.0)
 us_feet = "EPSG:2263\n980000 200000 100 5 6 a.JPG g\n"
 add(ODM_READER, Subject.UNIT, "assumed", "US survey foot", us_feet, height_m=100.0 * 1200 / 3937)
+add(ODM_READER, Subject.UNIT, "used", "US survey feet", us_feet + "# units: US survey feet\n")
+no_letter = ODM.replace("EPSG:32633", "WGS84 UTM 33")
+add(ODM_READER, Subject.HORIZONTAL_DATUM, "assumed", "northern", no_letter)
 add(ODM_READER, Subject.UNIT, "refused", "states feet", ODM + "# heights are in feet\n")
 add(ODM_READER, Subject.PIXEL_ORIGIN, "assumed", "centre", ODM)
 add(
