@@ -32,15 +32,15 @@ def read_text(path: FilePlace) -> str:
 def _decoded(data: bytes, name: str) -> str:
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         try:
-            return data.decode("utf-16")
+            return data.decode("utf-32" if data.startswith(codecs.BOM_UTF32_LE) else "utf-16")
         except UnicodeDecodeError:
             raise FormatError(
                 f"{name}: UTF-16 expected by its byte order mark; the text is damaged"
             ) from None
     if b"\0" in data[:1000]:
         raise FormatError(
-            f"{name}: expected a text, found bytes of 0: save it as UTF-8, or give the file that it "
-            "belongs to"
+            f"{name}: expected a text in UTF-8, or in UTF-16 with a byte order mark, found bytes of 0; "
+            "save it as UTF-8"
         )
     try:
         return data.decode("utf-8-sig")

@@ -108,7 +108,7 @@ def read_head(text: str) -> Head:
     for name, synonyms in _POSITION.items():
         others = _FILLER | ({"x", "y"} if name in ("lon", "lat") else set())
         if synonyms & set(rest) and set(rest) <= synonyms | others:
-            return Head(text, name, of_unit_m)
+            return Head(text, name, of_unit_m, subject=Subject.HORIZONTAL_DATUM)
     states = _states(words)
     if states is not None:
         return Head(text, subject=states, states=states)
@@ -160,7 +160,8 @@ def _height(text: str, words: list[str], of_unit_m: float | None) -> Head | None
     if len(geoids) + is_ellipsoidal > 1 or (is_sea and is_ellipsoidal):
         return None
     datum = ABOVE_SEA if is_sea else ELLIPSOIDAL if is_ellipsoidal else None
-    return Head(text, "height", of_unit_m, _GEOIDS[geoids.pop()] if geoids else datum)
+    datum = _GEOIDS[geoids.pop()] if geoids else datum
+    return Head(text, "height", of_unit_m, datum, subject=Subject.VERTICAL_DATUM)
 
 
 def chosen_height(heads: Sequence[Head], datum: str | None, source: str) -> int | None:

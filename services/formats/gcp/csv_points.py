@@ -220,9 +220,6 @@ def _columns(
             raise FormatError(f"{where}: found {len(found)} columns {found[0]!r}, expected one")
         if of_name:
             places[name] = (exact or of_name)[0]
-    height = _height_place(heads, header, layout, comments.heights or heights, source)
-    if height is not None:
-        places["height_m"] = height
     given = [position for position in _POSITIONS if position <= set(places)]
     is_projected = layout.crs is not None or (comments.crs is not None and comments.crs.is_projected)
     if len(given) == 2:
@@ -232,6 +229,9 @@ def _columns(
             f"{where}: expected the columns lon and lat, or x and y, found "
             f"{', '.join(header)[:200]}; name them (--columns lon=COLUMN,lat=COLUMN)"
         )
+    height = _height_place(heads, header, layout, comments.heights or heights, source)
+    if height is not None:
+        places["height_m"] = height
     for name in {"lon", "lat", "x", "y"} - given[0]:
         places.pop(name, None)
     unused = [(place, head) for place, head in enumerate(heads) if place not in places.values()]

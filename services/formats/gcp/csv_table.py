@@ -11,7 +11,7 @@ from amers.services.errors import FormatError
 
 _SEPARATOR = re.compile(r"sep=(.)\s*", re.IGNORECASE)
 """First line of files of Excel."""
-_DELIMITERS = ",;\t"
+_DELIMITERS = ",;\t|"
 _MAX_LINES_BEFORE_NAMES = 200
 
 

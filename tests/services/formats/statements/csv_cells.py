@@ -143,6 +143,9 @@ for column in ("EPSG", "crs", "SRID", "hdatum"):
     text = f"lon,lat,{column}\n12,41,4230\n"
     add(CSV_READER, Subject.HORIZONTAL_DATUM, "refused", "found 4230", text)
 add(CSV_READER, Subject.EPOCH, "named", "12.05.2021", "lon,lat,Datum\n12,41,12.05.2021\n")
+emlid = "Easting,Northing,Elevation,Longitude,Latitude,Ellipsoidal height\n1,2,52,12,41,100\n"
+add(CSV_READER, Subject.HORIZONTAL_DATUM, "named", "column Easting", emlid, lon_lat=(12.0, 41.0))
+add(CSV_READER, Subject.VERTICAL_DATUM, "named", "column Elevation", emlid, height_m=100.0)
 for head in ("Up", "HT", "RL", "U"):
     text = f"E,N,{head}\n275443.7,4646566.3,100\n"
     add(CSV_READER, Subject.VERTICAL_DATUM, "refused", f"{head!r} may have", text, stated=UTM)
@@ -166,6 +169,8 @@ dms = "lon,lat,height_m\n12°15'00.0\"E,41°30'0\"N,100.5\n"
 for text in (
     eu,
     eu.replace(";", "\t"),
+    eu.replace(";", "|"),
+    eu.encode("utf-32"),
     "sep=;\n" + eu,
     "\ufeff" + eu,
     eu.encode("utf-16"),
