@@ -139,10 +139,10 @@ def _datum_shift(crs: str, x: float, y: float, source: str) -> DatumShift:
     try:
         transformer = to_wgs84(crs)
         lon, lat = transformer.transform(x, y, errcheck=True)
-    except ProjError as error:
+    except ProjError:
         raise FormatError(
             f"{source}: reference system: {name}: expected one with a transformation to WGS 84"
-            f"{missing_grids(system) or f', PROJ knows none ({error})'}; state its code, or a "
+            f"{missing_grids(system) or ', PROJ knows none'}; state its code, or a "
             "definition with its datum (such as +towgs84=…), as in gdal_edit.py -a_srs EPSG:CODE"
         ) from None
     try:

@@ -172,7 +172,13 @@ def _driver(path: Path) -> str | None:
     headers += [path.with_name(f"{path.name}.hdr")]
     if any(header.is_file() and read_text(header).lstrip().startswith("ENVI") for header in headers):
         return "ENVI"
-    return DRIVER_OF_SUFFIX.get(path.suffix.lower())
+    driver = DRIVER_OF_SUFFIX.get(path.suffix.lower())
+    if driver is None:
+        raise FormatError(
+            f"{path}: expected a GeoTIFF, JPEG 2000 or NITF image, ENVI with its .hdr, or one of "
+            f"{', '.join(DRIVER_OF_SUFFIX)}, found another kind of file; convert it (gdal_translate)"
+        )
+    return driver
 
 
 def _vrt_sources(path: Path, deep: int) -> HeightsImage:

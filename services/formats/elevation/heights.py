@@ -216,9 +216,9 @@ def _of_file(crs: CRS) -> _OfFile:
 
 
 def _usual(vertical: CRS) -> CRS:
-    """The system of PROJ for a name such as "EGM96 geoid", which has no code; heights upwards."""
+    """The system of PROJ for a name such as "EGM96_Geoid", whatever its unit."""
     match = _EGM.search(vertical.name)
-    if match is None or vertical.to_epsg() is not None or vertical.axis_info[0].direction != "up":
+    if match is None or vertical.axis_info[0].direction.lower() != "up":
         return vertical
     names = {"84": "EGM84", "96": "EGM96", "08": "EGM2008"}
     return CRS.from_user_input(NAMED[names[match[1]]])

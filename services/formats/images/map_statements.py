@@ -35,7 +35,7 @@ def map_statements(
         origin = replace(origin, use=Use.ASSUMED, value="Area", where="", note=note)
     said.append(origin)
     unit = horizontal(grid.crs).axis_info[0].unit_name
-    if unit not in _PLAIN_UNITS:
+    if unit.lower() not in _PLAIN_UNITS:
         said.append(Statement(name, Subject.UNIT, Use.USED, unit, "map grid"))
     epoch = coordinate_epoch(image.path) if isinstance(image.path, Path) else None
     if epoch is not None:
