@@ -294,7 +294,12 @@ def _place_of(
 
 
 def _without_place(found: FoundModel, image: RasterImage) -> list[Statement]:
-    """What is assumed, or refused, of a tile whose place nothing states."""
+    """What is assumed, named or refused of an image whose place nothing states."""
+    magnification = image.dataset.tags().get("NITF_IMAG", "1.0").strip()
+    if magnification not in ("1.0", "1", "1.00", ""):
+        note = f"{found.name} is taken to be for these pixels, no ICHIPB states otherwise"
+        value = f"IMAG {magnification}"
+        return [Statement(image.path.name, Subject.PLACE, Use.NOT_USED, value, note=note)]
     tile = without_tile(image.path.stem) != image.path.stem and "_R1C1" not in image.path.stem.upper()
     if not tile:
         if found.shape in (None, image.shape):

@@ -186,6 +186,13 @@ def reduced_nitf_chip(folder: Path) -> Scene:
     return right(scene, chipped(0.125, 0.125, (1.25, 1.25)))
 
 
+@cell(SCENE, Subject.PLACE, "named", "IMAG /2: not used (tags of a.ntf is taken to be for these pixels")
+def reduced_nitf_without_a_place(folder: Path) -> Scene:
+    content = (GOLDEN / "invented_rpc00b.ntf").read_bytes()
+    (folder / "a.ntf").write_bytes(content.replace(b"1.0 ", b"/2  ", 1))
+    return read_scene(folder / "a.ntf")
+
+
 @cell(SCENE, Subject.PLACE, "refused", "XFRM_FLAG '01' found, 00 expected")
 def dewarped_nitf_chip(folder: Path) -> Scene:
     return read_scene(chip(folder, (4.0, 6.0, 1.0, 1.0), "01"))
