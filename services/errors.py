@@ -11,6 +11,7 @@ AmersError
     ├── NotEnoughPoints
     ├── NoConsensus
     │   ├── TurnedImage     they agree on an image whose axes are others than those of its model
+    │   ├── RescaledImage   they agree on an image with finer or coarser pixels than those of its model
     │   └── BrokenImage     lines of the image were lost or repeated
     ├── UndeterminedCorrection
     ├── DisconnectedBlock
@@ -112,6 +113,10 @@ class NoConsensus(ComputationError):
 
 class TurnedImage(NoConsensus):
     """The measures agree on an image that is mirrored, upside down or whose axes are swapped."""
+
+
+class RescaledImage(NoConsensus):
+    """The measures agree on an image whose pixels are finer or coarser than those of its model."""
 
 
 class BrokenImage(NoConsensus):

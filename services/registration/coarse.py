@@ -6,11 +6,13 @@ the middle of the finest chips.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from amers.services.conventions import CHIP_CENTRE, CHIP_SIZE, MAX_ERROR_SIGMAS
+from amers.services.errors import RescaledImage
 from amers.services.imagery.scene import Scene, scene_gsd_m
 from amers.services.imagery.source import ImageSource, ReducedImage, reduce_image
 from amers.services.matching.consensus import Consensus, Voters
@@ -55,17 +57,22 @@ def needs_coarse_search(context: PointContext, prediction: Prediction) -> bool:
     return bool(reach_px > context.options.coarse.max_fine_radius_px)
 
 
-def search_coarsely(context: PointContext, prediction: Prediction) -> Prediction:
+def search_coarsely(
+    context: PointContext, prediction: Prediction, rescaled: Callable[[], str] = lambda: ""
+) -> Prediction:
     """A better prediction of all points from few points searched far out, which must agree.
 
     Args:
         context: of the registration.
         prediction: of its points by the delivered model.
+        rescaled: how the pixels of the image differ from those of its model, asked before the search of
+            more points, which takes long; "" where they do not.
 
     Returns:
         The prediction by the corrected model.
 
     Raises:
+        RescaledImage: they agree on an image with other pixels.
         NoConsensus: the points found agree no better than by chance.
     """
     scene, options = context.scene, context.options
@@ -81,6 +88,7 @@ def search_coarsely(context: PointContext, prediction: Prediction) -> Prediction
     tries = [_search(context, prediction, gsd_m, rows)]
     max_false_alarms = options.coarse.max_false_alarms / _TRIES
     if tries[0].consensus.false_alarms > max_false_alarms:
+        refuse_rescaled(rescaled)
         tries += _with_smaller_chips(context, prediction)
         tries.sort(key=lambda one: one.consensus.false_alarms, reverse=True)
     context.stages.extend(one.stage for one in tries)
@@ -100,6 +108,17 @@ def search_coarsely(context: PointContext, prediction: Prediction) -> Prediction
     corrected = predict(scene, context.points, adjustment)
     uncertainty_m = np.hypot(corrected.uncertainty_m, stage.chip_gsd_m / 2.0)
     return Prediction(corrected.model, uncertainty_m)
+
+
+def refuse_rescaled(rescaled: Callable[[], str], error: Exception | None = None) -> None:
+    """Refuse an image with other pixels than its model has.
+
+    Raises:
+        RescaledImage: states how its pixels differ.
+    """
+    words = rescaled()
+    if words:
+        raise RescaledImage(words if error is None else f"{words} ({error})") from error
 
 
 def _with_smaller_chips(context: PointContext, prediction: Prediction) -> list[_Agreement]:

@@ -292,9 +292,9 @@ def _find(
     side, size = max((len(chip) for chip in templates), default=0), len(scene_map.pixels)
     found = np.full((len(templates), 2), np.nan)
     reason = np.full(len(templates), "nodata", dtype="<U16")
-    if not 0 < side <= size:
-        return found, reason
     missing = ~np.isfinite(scene_map.pixels)
+    if not 0 < side <= size or missing.all():
+        return found, reason
     pixels = scene_map.pixels - np.float32(np.nanmean(scene_map.pixels))
     pixels[missing] = 0.0
     contrast, unusable = _contrast(pixels, side), _gaps(missing, side) > _MAX_MISSING * side**2

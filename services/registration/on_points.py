@@ -1,6 +1,8 @@
 """SCENE IN -> REGISTERED MODEL OUT: predict, match, adjust, qualify. Start reading here."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import numpy as np
 
@@ -10,6 +12,7 @@ from amers.services.errors import (
     CoverageError,
     NoConsensus,
     NotEnoughPoints,
+    RescaledImage,
     TurnedImage,
 )
 from amers.services.imagery.line_breaks import scene_breaks
@@ -25,7 +28,7 @@ from amers.services.quality.stability import AdjustedScene
 from amers.services.registration.another_view import another_view
 from amers.services.registration.broken import naming_breaks
 from amers.services.registration.chip_selection import fine_gsd_m
-from amers.services.registration.coarse import needs_coarse_search, search_coarsely
+from amers.services.registration.coarse import needs_coarse_search, refuse_rescaled, search_coarsely
 from amers.services.registration.context import (
     PointContext,
     Prediction,
@@ -37,6 +40,7 @@ from amers.services.registration.missed_points import search_missed_points
 from amers.services.registration.options import RegistrationOptions
 from amers.services.registration.point_results import point_results
 from amers.services.registration.point_selection import initial_prediction, points_to_try, visible_points
+from amers.services.registration.rescaled import how_it_is_rescaled
 from amers.services.registration.search import (
     Search,
     adjust_search,
@@ -131,14 +135,19 @@ def register_scene(
         NotEnoughPoints: too few points were found.
         NoConsensus: the points found do not agree on one correction.
         TurnedImage: they agree on an image that is turned.
+        RescaledImage: they agree on an image with finer or coarser pixels than its model says.
         BrokenImage: too few points were found, or agree, and lines of the image were lost or repeated.
     """
+    rescaled = cache(partial(how_it_is_rescaled, scene, points, chips, options))
     try:
         with naming_breaks(scene):
             context, search, adjustment = search_scene(
-                scene, points, chips, options, progress=progress, stages=stages
+                scene, points, chips, options, progress=progress, stages=stages, rescaled=rescaled
             )
+    except RescaledImage:
+        raise
     except (NoConsensus, NotEnoughPoints) as error:
+        refuse_rescaled(rescaled, error)
         turned = _how_it_is_turned(scene, points, chips, options)
         if not turned:
             raise
@@ -173,6 +182,7 @@ def search_scene(
     *,
     progress: Progress = no_progress,
     stages: list[SearchStage] | None = None,
+    rescaled: Callable[[], str] = lambda: "",
 ) -> tuple[PointContext, Search, SceneAdjustment]:
     """The last search of the points of a scene, and the adjustment on it: see `register_scene`."""
     points = points.take(visible_points(scene, points))
@@ -189,7 +199,7 @@ def search_scene(
         fine_gsd_m=fine_gsd_m(scene, points, prediction),
     )
     if needs_coarse_search(context, prediction):
-        prediction = search_coarsely(context.part(0.0, 0.3), prediction)
+        prediction = search_coarsely(context.part(0.0, 0.3), prediction, rescaled)
     for stage, part in enumerate(context.parts(0.3, 0.6, options.fine_stages), start=1):
         rows = points_to_try(scene, points, prediction, options.max_points)
         last = stage == options.fine_stages

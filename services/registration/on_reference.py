@@ -1,11 +1,12 @@
 """SCENE AND REFERENCE IMAGE IN -> REGISTERED MODEL OUT, without control points."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from amers.services.conventions import CHIP_SIZE, MAX_ERROR_SIGMAS
-from amers.services.errors import ComputationError, CoverageError, NoConsensus
+from amers.services.errors import ComputationError, CoverageError, NoConsensus, NotEnoughPoints
 from amers.services.imagery.line_breaks import scene_breaks
 from amers.services.imagery.scene import Scene, scene_centre, scene_gsd_m
 from amers.services.imagery.source import (
@@ -27,6 +28,7 @@ from amers.services.matching.reference_image import (
 from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.quality.stability import image_places
 from amers.services.registration.broken import naming_breaks
+from amers.services.registration.coarse import refuse_rescaled
 from amers.services.registration.context import (
     PointContext,
     Prediction,
@@ -39,6 +41,7 @@ from amers.services.registration.on_points import Registration, build_registrati
 from amers.services.registration.options import RegistrationOptions
 from amers.services.registration.point_selection import initial_prediction
 from amers.services.registration.reference_points import ReferenceChips, reference_points
+from amers.services.registration.rescaled import how_it_is_rescaled
 from amers.services.registration.search import (
     Search,
     adjust_search,
@@ -52,7 +55,7 @@ from amers.services.registration.search import (
     summarise,
 )
 from amers.services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
-from amers.services.types import Array, Progress, no_progress
+from amers.services.types import Array, ControlPoints, Progress, no_progress
 
 _FAR = 0.25
 """Largest error, over the smaller side of a scene, at which places within the scene are enough."""
@@ -122,6 +125,7 @@ def register_on_reference(
         CoverageError: the reference or its terrain does not show what the scene shows.
         NotEnoughPoints: too few places were found.
         NoConsensus: the places found do not agree on one correction.
+        RescaledImage: they agree on an image with finer or coarser pixels than its model says.
         BrokenImage: too few places were found, or agree, and lines of the image were lost or repeated.
         InputError: heights move what the scene shows, and there is no terrain.
     """
@@ -134,8 +138,12 @@ def register_on_reference(
         reference=reference,
         finest_factor=_finest_factor(scene, reference),
     )
-    with naming_breaks(scene):
-        search, adjustment = _search_levels(context, earlier_places)
+    try:
+        with naming_breaks(scene):
+            search, adjustment = _search_levels(context, earlier_places)
+    except (NoConsensus, NotEnoughPoints) as error:
+        refuse_rescaled(partial(_how_it_is_rescaled, context), error)
+        raise
     of_places = _with_chips(context, search)
     search, adjustment, elsewhere = adjust_with_places(of_places, search, adjustment)
     return build_registration(context, search.points, search, adjustment, elsewhere)
@@ -197,16 +205,33 @@ def _search_around(context: _ReferenceContext) -> Prediction:
     The places of a level lie in the scene as its model predicts it. Those that a scene really shows,
     when it is off by much of its size, lie beside it.
     """
+    scene = context.scene
+    gsd_m = max(
+        context.gsd_m * context.finest_factor,
+        float(min(scene.image.shape)) * context.gsd_m / (_CHIPS_ACROSS * CHIP_SIZE),
+    )
+    points, chips = _points_around(context, gsd_m)
+    return search_far(context, points, chips, initial_prediction(scene, points), gsd_m)
+
+
+def _how_it_is_rescaled(context: _ReferenceContext) -> str:
+    """How the pixels of a scene that was not found differ from those of its model; "" if unseen."""
+    (reference_gsd_m,) = image_gsds_m(context.reference.model, scene_centre(context.scene)[None, :])
+    try:
+        points, chips = _points_around(context, float(reference_gsd_m))
+    except CoverageError:
+        return ""
+    return how_it_is_rescaled(context.scene, points, chips, context.options)
+
+
+def _points_around(context: _ReferenceContext, gsd_m: float) -> tuple[ControlPoints, ReferenceChips]:
+    """Points with chips of the reference in a scene and around it, as far as its model may be off."""
     scene, reference = context.scene, context.reference
     size = np.array(scene.image.shape, dtype=np.float64)
     reach_px = MAX_ERROR_SIGMAS * scene.sigma_m / context.gsd_m
     step = np.sqrt(size.prod() / context.options.coarse.points)
     axes = [np.arange(-reach_px, length + reach_px, step) for length in size]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    gsd_m = max(
-        context.gsd_m * context.finest_factor,
-        float(size.min()) * context.gsd_m / (_CHIPS_ACROSS * CHIP_SIZE),
-    )
     ground = locate_on_terrain(scene.model, grid, reference.terrain)
     seen = reference.model.project(ground)
     known = np.isfinite(ground).all(axis=1) & np.isfinite(seen).all(axis=1)
@@ -220,8 +245,7 @@ def _search_around(context: _ReferenceContext) -> Prediction:
             f"{context.options.adjustment.min_points} needed: it lies elsewhere, or its terrain is void"
         )
     points = reference_points(ground, reference, gsd_m)
-    chips = ReferenceChips(reference, ground, gsd_m)
-    return search_far(context, points, chips, initial_prediction(scene, points), gsd_m)
+    return points, ReferenceChips(reference, ground, gsd_m)
 
 
 def _next_level(

@@ -11,6 +11,7 @@ from amers.services.errors import (
     CoverageError,
     NoConsensus,
     NotEnoughPoints,
+    RescaledImage,
     TurnedImage,
 )
 from amers.services.quality.accuracy_statement import AccuracyStatement, StatedAccuracy, no_accuracy
@@ -113,6 +114,9 @@ def next_steps(
     if isinstance(error, TurnedImage):
         text = "Turn the image or its model as the reason says, and run the registration again."
         return (NextStep(text, command),)
+    if isinstance(error, RescaledImage):
+        text = "Give the model of this image, or the image of this model, and register again."
+        return (NextStep(text, f"{command} --model FILE"),)
     if isinstance(error, BrokenImage):
         text = (
             "Have the image delivered without lost or repeated lines, or cut it at the lines that the "

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 
+import cv2
 import numpy as np
 
 from amers.services.imagery.scene import Scene
@@ -109,3 +110,12 @@ def point_context(
 
 def predicted(of: Scene, points: ControlPoints) -> Prediction:
     return initial_prediction(of, points)
+
+
+def resampled(factor: float, sigma_m: float = 10.0, size: int = 700) -> Scene:
+    """A scene whose pixels are finer by a factor than its model says."""
+    of = scene(np.array([12.0, -9.0]), sigma_m, size, size)
+    pixels = of.image.read(Window(0, 0, size, size))
+    side = round(size * factor)
+    way = cv2.INTER_AREA if factor < 1.0 else cv2.INTER_CUBIC
+    return replace(of, image=ArrayImage(np.asarray(cv2.resize(pixels, (side, side), interpolation=way))))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from amers.services.errors import NoConsensus
+from amers.services.errors import NoConsensus, RescaledImage
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage, Window
 from amers.services.matching.reference_image import Reference
@@ -15,7 +15,7 @@ from amers.services.registration.on_reference import register_on_reference
 from amers.services.registration.options import ReferenceOptions, RegistrationOptions
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.types import Array
-from tests.services.registration.small_ground import GRID, GSD_M, scene, whole
+from tests.services.registration.small_ground import GRID, GSD_M, resampled, scene, whole
 
 OPTIONS = RegistrationOptions(reference=ReferenceOptions(places=100, leading_places=36))
 OFF_M = np.array([52.0, -38.0])
@@ -44,6 +44,13 @@ def error_px(registration: Registration, of: Scene, off_m: Array) -> float:
 
 def stages_of(of: Scene, options: RegistrationOptions = OPTIONS) -> list[SearchStage]:
     return list(registered(of, options).search_stages)
+
+
+@pytest.mark.parametrize(("factor", "words"), [(2.0, "2 times finer"), (0.5, "2 times coarser")])
+def test_an_image_with_other_pixels_than_its_model_is_named(factor: float, words: str) -> None:
+    of = resampled(factor, sigma_m=6.0)
+    with pytest.raises(RescaledImage, match=f"the pixels of the image are {words} than its model says"):
+        registered(of)
 
 
 def test_a_scene_is_brought_onto_the_reference_from_few_coarse_places_to_all_fine_ones() -> None:

@@ -13,6 +13,7 @@ from amers.services.errors import (
     FormatError,
     NoConsensus,
     NotEnoughPoints,
+    RescaledImage,
     TurnedImage,
 )
 from amers.services.registration.context import Candidate, NotFound, SearchStage
@@ -141,6 +142,12 @@ def test_a_turned_image_is_to_be_turned_and_not_searched_farther(report):
     (step,) = next_steps(TurnedImage("upside down"), report.scene, (STAGE,), COMMAND)
     assert step.text.startswith("Turn the image or its model")
     assert step.command == COMMAND
+
+
+def test_an_image_with_other_pixels_gets_its_own_model(report):
+    (step,) = next_steps(RescaledImage("2 times finer"), report.scene, (STAGE,), COMMAND)
+    assert step.text.startswith("Give the model of this image")
+    assert step.command == f"{COMMAND} --model FILE"
 
 
 def test_an_image_with_lost_lines_is_to_be_cut_before_it_is_searched_otherwise(report):
