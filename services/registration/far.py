@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from amers.services.conventions import CHIP_CENTRE, CHIP_SIZE
+from amers.services.errors import NotEnoughPoints
 from amers.services.geodesy import east_north_up, lon_lat_h_from_east_north_up
 from amers.services.imagery.gaps import filled
 from amers.services.imagery.scene import Scene, scene_centre, scene_gsd_m
@@ -147,10 +148,13 @@ def search_far(
         gsd_m: ground sampling of the chips to use.
 
     Raises:
+        NotEnoughPoints: the scene is expected to show no point whole.
         NoConsensus: the points found agree no better than by chance.
     """
     scene, options = context.scene, context.options.coarse
     plan = _plan(context, points, prediction, gsd_m)
+    if not len(plan.rows):
+        raise NotEnoughPoints(0, 2, "the scene is expected to show none of them whole")
     tried = points.take(plan.rows)
     context.progress(0.0, f"searching {len(tried)} points within {plan.error_m / 1000.0:.1f} km")
     predicted = prediction.model.project(tried.lon_lat_h)
