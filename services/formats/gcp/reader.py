@@ -66,7 +66,7 @@ class StatedByCaller:
     heights: Heights | None = None
     sigma_axes: str | None = None
     csv: CsvLayout = field(default_factory=lambda: CsvLayout({}))
-    options: str = "--"
+    options: str = field(default="--", compare=False)
 
 
 @dataclass(frozen=True)
