@@ -82,11 +82,14 @@ class MaskedImage:
 
     @cached_property
     def statements(self) -> Statements:
-        """Of the image, and of the mask about valid pixels."""
-        note = "laid over the whole image" if self.grids is None else "laid by its map grid"
+        """Of the image, and of the mask about valid pixels and its place."""
         name = self.mask.path.name
-        said = Statement(name, Subject.VALIDITY, Use.USED, "mask: no data where it is not 0", "", note)
-        return (*self.image.statements, said)
+        said = Statement(name, Subject.VALIDITY, Use.USED, "mask: no data where it is not 0")
+        if self.grids is not None:
+            place = Statement(name, Subject.PLACE, Use.USED, "map grid of the mask")
+        else:
+            place = Statement(name, Subject.PLACE, Use.ASSUMED, f"the frame of {self.image.path.name}")
+        return (*self.image.statements, said, place)
 
     def close(self) -> None:
         """Close both files."""

@@ -80,10 +80,10 @@ class Validity:
             return None
         if pixels.dtype.kind != "f":
             return np.asarray(pixels == value)
-        # Written in fewer digits than the pixels have.
-        return np.asarray(
-            np.isnan(pixels) | (np.abs(pixels - value) <= 4.0 * np.spacing(np.abs(pixels)))
-        )
+        # The file may state it in fewer digits than the pixels have.
+        with np.errstate(over="ignore", invalid="ignore"):
+            near = np.abs(pixels - value) <= 4.0 * np.spacing(np.abs(pixels))
+        return np.asarray(np.isnan(pixels) | near)
 
     def close(self) -> None:
         """Close the mask."""
