@@ -8,7 +8,7 @@ import typer
 
 from amers.app.cli.exit_status import NO_RESULT
 from amers.app.cli.options import FromMilli, Shown
-from amers.app.cli.output import AsJson, Row, print_json, show_one
+from amers.app.cli.output import AsJson, Row, print_json, show_one, show_statements
 from amers.app.cli.progress import shown_progress
 from amers.app.cli.terrain_options import TerrainOptions
 from amers.app.cli.transaction import transaction
@@ -160,6 +160,7 @@ def _show_report(report: BlockQualityReport, output: Path | None, *, as_json: bo
     if as_json:
         print_json(report_document(report))
         return
+    show_statements(report.statements)
     print_text(QUALITY_PAGE, report)
     typer.echo(f"{report.verdict}: {report.verdict_words}")
     if output is not None:

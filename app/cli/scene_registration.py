@@ -38,7 +38,7 @@ from amers.app.usecases.registration.register import (
 from amers.app.usecases.registration.result_folder import older_result, replacing
 from amers.app.usecases.report_files import REPORT_FILES
 from amers.app.worker.warm_process import WarmProcess, WarmServer
-from amers.services.formats.sensor_models.product_image import IMAGE_SUFFIXES, scenes_in
+from amers.services.formats.sensor_models.product_files import IMAGE_SUFFIXES, scenes_in
 from amers.services.quality.accuracy_statement import accuracy_document
 from amers.services.quality.qualification import QualificationOptions
 from amers.services.registration.options import RegistrationOptions

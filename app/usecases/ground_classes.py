@@ -1,6 +1,7 @@
 """Ground of a new block: excluded areas, and the land cover at the points."""
 
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 
 from amers.services.formats.ground_masks import LandCover, any_of, read_ground_mask, read_land_cover
 from amers.services.quality.density import GroundMask
+from amers.services.statements import Statements
 from amers.services.types import Array, BoolArray, ControlPoints
 
 UNSTEADY = ("water", "snow and ice")
@@ -48,10 +50,12 @@ class GroundClasses:
     Attributes:
         excluded: where no points are wanted; None where they are wanted everywhere.
         land_cover: at positions; None when it is not known.
+        statements: of the files.
     """
 
     excluded: GroundMask | None
     land_cover: LandCover | None
+    statements: Statements = ()
 
     def typology(self, points: ControlPoints) -> list[str | None] | None:
         """What each point stands on; None when nothing is known."""
@@ -67,7 +71,9 @@ def read_ground(files: GroundFiles) -> GroundClasses:
     Raises:
         InputError: a file cannot be read.
     """
-    masks: list[GroundMask] = [read_ground_mask(path) for path in files.exclude]
+    excluded = [read_ground_mask(path) for path in files.exclude]
+    masks: list[GroundMask] = [*excluded]
+    statements = tuple(chain(*(mask.statements for mask in excluded)))
     cover = None if files.land_cover is None else read_land_cover(files.land_cover)
     if cover is not None:
 
@@ -75,4 +81,5 @@ def read_ground(files: GroundFiles) -> GroundClasses:
             return np.isin(cover(lon_lat), UNSTEADY)
 
         masks.append(unsteady)
-    return GroundClasses(any_of(masks), cover)
+        statements += cover.statements
+    return GroundClasses(any_of(masks), cover, statements)

@@ -121,7 +121,7 @@ def run_image_production(
             excluded=ground.excluded,
             work=work,
         )
-        stated = chain(*(scene.statements for scene in scenes), control.statements)
+        stated = chain(*(scene.statements for scene in scenes), control.statements, ground.statements)
         production = replace(production, statements=gathered(stated))
         # Before the block, whose folder would refuse the run that makes up for a missing report.
         _write_report(report_folder, identity.id, production)

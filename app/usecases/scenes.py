@@ -26,7 +26,7 @@ from amers.app.usecases.server_files import file_below
 from amers.services.errors import FormatError
 from amers.services.formats.images.signatures import DRIVER_OF_SIGNATURE
 from amers.services.formats.sensor_models.product_documents import is_document, read_product
-from amers.services.formats.sensor_models.product_image import tile_file, whole_product
+from amers.services.formats.sensor_models.product_files import tile_file, whole_product
 
 LONGEST_NAME = 120
 LONGEST_SIGNATURE = max(len(signature) for signature in DRIVER_OF_SIGNATURE)

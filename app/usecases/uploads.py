@@ -41,7 +41,7 @@ from amers.services.formats.archives import (
     unpack_archive,
 )
 from amers.services.formats.sensor_models.product_documents import without_tile
-from amers.services.formats.sensor_models.product_image import IMAGE_SUFFIXES, whole_product
+from amers.services.formats.sensor_models.product_files import IMAGE_SUFFIXES, whole_product
 
 PURPOSES: tuple[UploadPurpose, ...] = ("image", "model", "block")
 UPLOAD_PREFIX = "upload-"

@@ -13,6 +13,7 @@ from amers.services.formats.sensor_models import (
     rpc_text,
     worldview_isd,
 )
+from amers.services.formats.stac import scenes as stac_scenes
 from amers.services.formats.vector import map_layers
 
 READERS: tuple[Reader, ...] = (
@@ -32,6 +33,7 @@ READERS: tuple[Reader, ...] = (
     *TERRAIN_READERS,
     map_layers.READER,
     ground_masks.READER,
+    stac_scenes.READER,
 )
 """In the order of `docs/inputs.md`."""
 

@@ -32,6 +32,7 @@ from amers.services.quality.density import share_reaching
 from amers.services.quality.planimetry import PlanimetricQuality
 from amers.services.quality.site_errors import SiteErrors
 from amers.services.reports.report import NOT_IN_JSON
+from amers.services.statements import Statements
 from amers.services.types import Array, ControlPoints
 
 BLOCK_QUALITY_FORMAT = "amers-block-quality/1"
@@ -179,6 +180,7 @@ class BlockQualityReport:
         assessed_at: UTC; ages are those at this time.
         seconds: that the assessment took.
         software_version: of Amers.
+        statements: of the files of the references, and what became of each.
     """
 
     format: str
@@ -200,6 +202,7 @@ class BlockQualityReport:
     seconds: float
     software_version: str
     errors: MeasuredErrors = field(metadata=NOT_IN_JSON)
+    statements: Statements = ()
 
 
 @dataclass(frozen=True)

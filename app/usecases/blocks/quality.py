@@ -3,9 +3,10 @@
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 
 from amers.app.errors import InputError
@@ -35,6 +36,7 @@ from amers.services.reports.block_quality import (
     block_quality_report,
 )
 from amers.services.reports.block_quality_pages import QUALITY_PAGE
+from amers.services.statements import Statements, gathered
 from amers.services.types import ChipSource, ControlPoints, Progress, no_progress, part_of
 
 LEAST_INCLINED = 10
@@ -190,16 +192,18 @@ def assess_block(
     started, now = time.monotonic(), datetime.now(UTC)
     points, metadata = block.points, block.metadata
     requirements = required.of_block(metadata)
-    excluded = any_of([read_ground_mask(path) for path in references.excluded])
+    masks = [read_ground_mask(path) for path in references.excluded]
+    stated = [mask.statements for mask in masks]
+    excluded = any_of([*masks])
     progress(0.0, "density")
     cells = block_cells(points, metadata.extent, requirements.min_views, now, excluded)
     heights, height_errors = None, None
     if references.heights is not None:
         progress(0.1, "heights")
-        heights, height_errors = _measure_heights(points, references.heights)
-    planimetry, errors = _measure_sites(block, references, part_of(progress, 0.3, 0.7))
+        heights, height_errors = _measure_heights(points, references.heights, stated)
+    planimetry, errors = _measure_sites(block, references, stated, part_of(progress, 0.3, 0.7))
     progress(1.0, "done")
-    return block_quality_report(
+    report = block_quality_report(
         BlockIdentification(metadata.id, metadata.version, metadata.title, metadata.created),
         points,
         cells,
@@ -209,6 +213,7 @@ def assess_block(
         seconds=time.monotonic() - started,
         software_version=version("amers"),
     )
+    return replace(report, statements=gathered(chain(*stated)))
 
 
 def write_quality(report: BlockQualityReport, folder: Path) -> None:
@@ -226,26 +231,37 @@ def write_quality_files(report: BlockQualityReport, folder: Path) -> dict[str, P
     return write_report(folder, QUALITY_PAGE, report, "block_quality")
 
 
-def _measure_heights(points: ControlPoints, files: HeightFiles) -> tuple[HeightQuality, HeightErrors]:
+def _measure_heights(
+    points: ControlPoints, files: HeightFiles, stated: list[Statements]
+) -> tuple[HeightQuality, HeightErrors]:
+    """The heights of points against a height model; what its files state is added to `stated`."""
     terrain = read_terrain(files.terrain)
+    masks = [read_ground_mask(path) for path in files.excluded]
+    stated.extend([terrain.statements, *(mask.statements for mask in masks)])
     model = HeightModel(
         terrain,
         files.sigma_m or HEIGHT_SIGMA_POSTINGS * terrain.posting_m,
         files.frame_sigma_m or 0.0,
-        any_of([read_ground_mask(path) for path in files.excluded]),
+        any_of([*masks]),
     )
     errors = compare_heights(points, model)
     cover = None
     if files.land_cover is not None:
-        cover = read_land_cover(files.land_cover)(errors.lon_lat)
+        classes = read_land_cover(files.land_cover)
+        stated.append(classes.statements)
+        cover = classes(errors.lon_lat)
     return summarise_heights(errors, points, model, files.terrain.dem.name, cover), errors
 
 
 def _measure_sites(
-    block: BlockToAssess, references: QualityReferences, progress: Progress
+    block: BlockToAssess,
+    references: QualityReferences,
+    stated: list[Statements],
+    progress: Progress,
 ) -> tuple[tuple[PlanimetricQuality, ...], tuple[SiteErrors, ...]]:
     """The planimetry of the points at sites, then that of the images where there are any."""
     sites = _read_sites(references)
+    stated.extend(site.reference.statements for site in sites)
     if not sites:
         return (), ()
     frame, share = block.points.frames[0], (0.5 if references.images else 1.0) / len(sites)

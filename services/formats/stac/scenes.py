@@ -1,21 +1,57 @@
 """Scenes of STAC items: their image files, with what the items state of them."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import shapely
+from pyproj import CRS
+from pyproj.exceptions import CRSError
 
+from amers.services.datums import horizontal
 from amers.services.errors import FormatError
 from amers.services.formats.addresses import Address, FilePlace, file_place
 from amers.services.formats.images.scenes import read_scene
-from amers.services.formats.stac.items import Json, parse_item
+from amers.services.formats.reader_rows import Reader, Treatment
+from amers.services.formats.stac.items import Json, StacImage, parse_item
 from amers.services.imagery.hidden import without_hidden_ground
 from amers.services.imagery.scene import Scene
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.statements import Statement, Subject, Use
 
 _IMAGE_TYPES = ("image/tiff", "image/jp2", "application/vnd.nitf")
 _IMAGE_NAMES = (".tif", ".tiff", ".jp2", ".ntf", ".nitf")
+
+
+READER = Reader(
+    "Items of STAC catalogues",
+    ("read_catalogue", "read_item_scene"),
+    (
+        Treatment(Subject.IDENTITY, "used", "`id`, `platform` and time name the image"),
+        Treatment(Subject.IDENTITY, "refused", "an id that two items have; no id"),
+        Treatment(Subject.VALIDITY, "used", "masks in GeoJSON: the ground that they hide"),
+        Treatment(Subject.VALIDITY, "named", "masks in other formats"),
+        Treatment(Subject.BANDS, "refused", "several images of which none has the role data"),
+        Treatment(Subject.HORIZONTAL_DATUM, "refused", "another than WGS 84 of a mask in GeoJSON"),
+        Treatment(
+            Subject.HORIZONTAL_DATUM,
+            "named",
+            "`proj:code` or `proj:epsg` other than that of the image, which is used",
+        ),
+        Treatment(Subject.ORDER, "refused", "latitudes beyond 90 degrees of the footprint"),
+        Treatment(Subject.ACCURACY, "named", "`accuracy:…`: what it is of differs between producers"),
+        Treatment(Subject.UNIT, "refused", "angles and shares out of their range"),
+    ),
+    never=(
+        Subject.MODEL,
+        Subject.PLACE,
+        Subject.PIXEL_ORIGIN,
+        Subject.VERTICAL_DATUM,
+        Subject.EPOCH,
+    ),
+)
 
 
 def read_item_scene(
@@ -49,7 +85,39 @@ def read_item_scene(
         sun_elevation_deg=stated.sun_elevation_deg,
         sun_azimuth_deg=stated.sun_azimuth_deg,
     )
-    return replace(scene, acquisition=acquisition)
+    own = _statements(item["properties"], stated, scene, hidden)
+    return replace(scene, acquisition=acquisition, statements=(*own, *scene.statements))
+
+
+def _statements(
+    properties: Json, stated: StacImage, scene: Scene, hidden: shapely.Geometry | None
+) -> Iterator[Statement]:
+    """What became of the statements of an item about its image."""
+    name = stated.key[1]
+    yield Statement(name, Subject.IDENTITY, Use.USED, stated.platform or name)
+    if hidden is not None:
+        yield Statement(name, Subject.VALIDITY, Use.USED, "masks in GeoJSON")
+    if stated.other_masks:
+        value = f"{stated.other_masks} masks"
+        note = "they are no GeoJSON; --exclude takes masks on a map"
+        yield Statement(name, Subject.VALIDITY, Use.NOT_USED, value, "assets", note)
+    code = properties.get("proj:code") or properties.get("proj:epsg")
+    if code is not None and isinstance(scene.model, OrthoModel):
+        crs = str(code) if ":" in str(code) else f"EPSG:{code}"
+        if not _is_same(crs, scene.model.grid.crs):
+            note = "that of the image is used"
+            yield Statement(name, Subject.HORIZONTAL_DATUM, Use.NOT_USED, crs, "proj", note)
+    for key in sorted(key for key in properties if key.startswith("accuracy:")):
+        value = f"{key} {properties[key]}"[:80]
+        yield Statement(name, Subject.ACCURACY, Use.NOT_USED, value, note="--sigma-m states it")
+
+
+def _is_same(code: str, crs: str) -> bool:
+    """Whether a code is that of the horizontal system of an image; an unknown code is of none."""
+    try:
+        return horizontal(CRS.from_user_input(code)) == horizontal(CRS.from_user_input(crs))
+    except CRSError:
+        return False
 
 
 def image_place(item: Json, source: str) -> FilePlace:

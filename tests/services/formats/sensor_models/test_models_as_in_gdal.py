@@ -13,7 +13,8 @@ from rasterio.transform import RPCTransformer
 from amers.services.errors import FormatError
 from amers.services.formats.images.scenes import read_scene, scene_name
 from amers.services.formats.sensor_models.model_order import SAME_PX
-from amers.services.formats.sensor_models.product_image import files_to_send, scenes_in, whole_product
+from amers.services.formats.sensor_models.product_files import scenes_in, whole_product
+from amers.services.formats.sensor_models.product_image import files_to_send
 from amers.services.formats.sensor_models.rpc_files import read_rpc, write_model
 from amers.services.imagery.source import Window
 from amers.services.sensors.rpc import RpcModel
