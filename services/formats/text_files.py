@@ -3,6 +3,7 @@
 import codecs
 import json
 import re
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -14,6 +15,8 @@ NUMBER_PATTERN = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 """Pattern of a decimal number; "nan" and "inf" do not match."""
 
 _MAX_TEXT_BYTES = 20_000_000
+_KEPT_LETTERS = 500_000
+"""Length of XML documents whose trees are kept for a while: those of products without ephemerides."""
 
 
 def read_text(path: FilePlace) -> str:
@@ -92,6 +95,12 @@ def parse_xml(text: str, source: str) -> ElementTree.Element:
     if "<!DOCTYPE" in text:
         raise FormatError(f"{source}: <!DOCTYPE found, a document without a document type expected")
     try:
-        return ElementTree.fromstring(text)
+        return _tree(text) if len(text) <= _KEPT_LETTERS else ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
         raise FormatError(f"{source}: expected a well-formed XML document: {error}") from None
+
+
+@lru_cache(maxsize=2)
+def _tree(text: str) -> ElementTree.Element:
+    """The tree of a document, kept for the readers that look into the same one; none changes it."""
+    return ElementTree.fromstring(text)

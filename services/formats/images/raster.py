@@ -155,17 +155,23 @@ class RasterImage:
 
     def _fill_mix(self, out: FloatImage, dataset: rasterio.DatasetReader, window: RasterWindow) -> None:
         out[:] = 0.0
-        one, lost = np.empty_like(out), np.zeros(out.shape, dtype=np.float32)
+        one, lost = np.empty_like(out), None
         for band, weight in zip(self.mix.bands, self.mix.weights, strict=True):
             self._fill_band(one, dataset, band, window)
-            missing = np.isnan(one)
-            if missing.any():
+            missing = np.isnan(one) if self._has_gaps(band) else None
+            if missing is not None and missing.any():
+                lost = np.zeros(out.shape, dtype=np.float32) if lost is None else lost
                 one[missing] = 0.0
                 lost[missing] += np.float32(weight)
             out += np.float32(weight) * one
-        if lost.any():
+        if lost is not None:
             lost[lost >= _ALL_LOST] = np.nan
             out /= 1.0 - lost
+
+    def _has_gaps(self, band: int) -> bool:
+        """Whether pixels of a band may have no data."""
+        is_whole = np.dtype(self.dataset.dtypes[band - 1]).kind in "ui"
+        return not is_whole or self.codes.nodata is not None or self.validity.is_stated(band)
 
     def _fill_band(
         self, out: FloatImage, dataset: rasterio.DatasetReader, band: int, window: RasterWindow

@@ -148,11 +148,13 @@ def read_scene(
         if parameter_set is not None:
             rigorous = rigorous_model_of_image(image, model_path, crop_origin)
         grid = map_grid_of(image) if rigorous is None else None
-        has_model = model_path is not None or crop_origin is not None or has_rpc(image, siblings)
-        if grid is not None and not has_model:
-            return _ortho_scene(image, grid, sigma_m, mask)
-        alone = rigorous is not None and not has_model
-        file = rigorous.path if rigorous is not None and alone else model_path
+        file: FilePlace | None = model_path
+        if grid is not None or rigorous is not None:
+            has_model = model_path is not None or crop_origin is not None or has_rpc(image, siblings)
+            if grid is not None and not has_model:
+                return _ortho_scene(image, grid, sigma_m, mask)
+            if rigorous is not None and not has_model:
+                file = rigorous.path
         delivered = model_of_image(image, file, crop_origin, siblings)
         acquisition = _acquisition(image, delivered)
         image = _with_codes(image, delivered)

@@ -17,7 +17,7 @@ from amers.services.errors import FormatError
 from amers.services.formats.images.bands import PixelCodes
 from amers.services.formats.reader_rows import Reader, Treatment
 from amers.services.formats.sensor_models.rpc_text import rpc_from_numbers
-from amers.services.formats.sensor_models.xml_values import single
+from amers.services.formats.sensor_models.xml_values import elements_by_tag, single
 from amers.services.formats.text_files import parse_number, parse_xml
 from amers.services.sensors.rpc import RpcModel
 from amers.services.sensors.rpc_fit import fit_to_ground
@@ -82,14 +82,16 @@ def parse_dimap_rpc(text: str, source: str = "DIMAP") -> RpcModel:
         FormatError: it is not such a document, or a number is missing or given twice.
     """
     root = parse_xml(text, source)
-    model = single(root, _layout(root, source)[0], source)
-    validity = single(root, "RFM_Validity", source)
+    model = elements_by_tag(single(root, _layout(root, source)[0], source))
+    validity = elements_by_tag(single(root, "RFM_Validity", source))
 
     def number(key: str) -> float:
         if key.startswith("ERR_"):
             return math.nan
-        parent = model if "COEFF" in key else validity
-        return parse_number(single(parent, key, source).text or "", key, source)
+        found = (model if "COEFF" in key else validity).get(key, [])
+        if len(found) != 1:
+            raise FormatError(f"{source}: expected one {key} in the model, found {len(found)}")
+        return parse_number(found[0].text or "", key, source)
 
     return rpc_from_numbers(number, dimap_first_pixel(root, source))
 

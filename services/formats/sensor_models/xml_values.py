@@ -25,6 +25,14 @@ def single(parent: ElementTree.Element, path: str, source: str) -> ElementTree.E
     return elements[0]
 
 
+def elements_by_tag(parent: ElementTree.Element) -> dict[str, list[ElementTree.Element]]:
+    """All elements anywhere below another element, by their tags: for readers of many of them."""
+    found: dict[str, list[ElementTree.Element]] = {}
+    for element in parent.iter():
+        found.setdefault(element.tag, []).append(element)
+    return found
+
+
 def number(
     parent: ElementTree.Element,
     path: str,
