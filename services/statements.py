@@ -51,6 +51,8 @@ class Statement:
         where: the place in the file, such as "column height" or "band 1"; "" for the whole file.
         note: what follows from it, or which option changes it; "" where nothing has to be said.
         more_files: number of other files with the same statement; see `gathered`.
+        is_usual: whether files of this kind are commonly like that, so that only the report and `--json`
+            say it: a terminal that says the usual hides what is not.
     """
 
     file: str
@@ -60,6 +62,7 @@ class Statement:
     where: str = ""
     note: str = ""
     more_files: int = 0
+    is_usual: bool = False
 
     def __str__(self) -> str:
         """One sentence for people."""
@@ -87,5 +90,5 @@ def gathered(statements: Iterable[Statement]) -> Statements:
 
 
 def worth_saying(statements: Iterable[Statement]) -> Statements:
-    """The statements that a terminal shows: what was assumed, and what was not used."""
-    return tuple(statement for statement in statements if statement.use != Use.USED)
+    """The statements that a terminal shows: what was assumed or not used, unless it is usual."""
+    return tuple(one for one in statements if one.use != Use.USED and not one.is_usual)

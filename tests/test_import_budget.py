@@ -24,8 +24,8 @@ BUDGETS = {
     "audit --help": STORE,
     "block list --help": LISTING,
     "block publish --help": STORE,
-    # The jobs are done by other processes, which a warm server of the worker forks. Files of products may
-    # lie in buckets: obstore takes 4 ms.
+    # The jobs are done by other processes, which a warm server of the worker forks. Products may lie in
+    # buckets: obstore takes 4 ms.
     "worker --help": STORE | {"obstore", "procrastinate"},
     # Without the statistics of scipy: a third of the time that its start takes.
     "scene register --help": PACKAGES - {"scipy.stats", "fastapi", "matplotlib", "pandas", "uvicorn"},

@@ -314,6 +314,8 @@ def _unit(
         return float(factor), (system,)
     note = "state it otherwise with gdal_edit.py -units"
     horizontal_unit = crs.axis_info[0].unit_name
-    if crs.is_projected and crs.axis_info[0].unit_conversion_factor != 1.0:
+    is_in_metres = not crs.is_projected or crs.axis_info[0].unit_conversion_factor == 1.0
+    if not is_in_metres:
         note = f"though positions are in {horizontal_unit}: " + note
-    return 1.0, (Statement(source, Subject.UNIT, Use.ASSUMED, "metre", "heights", note),)
+    metre = Statement(source, Subject.UNIT, Use.ASSUMED, "metre", "heights", note)
+    return 1.0, (replace(metre, is_usual=is_in_metres),)

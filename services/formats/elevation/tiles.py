@@ -140,7 +140,16 @@ def _of_values(image: HeightsImage) -> Statements:
         others.append(Statement(name, Subject.PLACE, Use.USED, name[:7], "name of the file"))
     if not image.validity.is_stated(1):
         note = f"voids are {UNDECLARED_VOID:g}, and heights that no ground has"
-        others.append(Statement(name, Subject.VALIDITY, Use.ASSUMED, "no value for voids", note=note))
+        others.append(
+            Statement(
+                name,
+                Subject.VALIDITY,
+                Use.ASSUMED,
+                "no value for voids",
+                note=note,
+                is_usual=True,
+            )
+        )
     if (image.scale, image.offset) != (1.0, 0.0):
         value = f"scale {image.scale:g}, offset {image.offset:g}"
         others.append(replace(used, value=value))

@@ -227,7 +227,8 @@ def _accuracy(delivered: DeliveredModel, sensor: str, sigma_m: float | None) -> 
         if not stated_m > 0.0 or sigma_m == stated_m:
             return sigma_m, ()
         value, note = f"bias {stated_m:g} m", f"{sigma_m:g} m was given"
-        return sigma_m, (Statement(name, Subject.ACCURACY, Use.NOT_USED, value, note=note),)
+        stated = Statement(name, Subject.ACCURACY, Use.NOT_USED, value, note=note, is_usual=True)
+        return sigma_m, (stated,)
     prior_m = prior_sigma_m(model, sensor)
     if stated_m > 0.0:
         return prior_m, (Statement(name, Subject.ACCURACY, Use.USED, f"{prior_m:.2f} m, one sigma"),)

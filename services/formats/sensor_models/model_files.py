@@ -1,7 +1,7 @@
 """One model in one file: RPC text, RPB, ISD, DIMAP, `.geom`, `.aux.xml` or the tags of an image."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 from xml.etree import ElementTree
 from xml.sax.saxutils import escape
@@ -159,7 +159,8 @@ def _read_xml(text: str, path: FilePlace) -> FoundModel:
     if error is not None:
         note = "of the fit of the polynomials, not of the scene"
         value = f"{error.tag} {(error.text or '').strip()[:20]}"
-        stated.append(Statement(path.name, Subject.ACCURACY, Use.NOT_USED, value, note=note))
+        accuracy = Statement(path.name, Subject.ACCURACY, Use.NOT_USED, value, note=note)
+        stated.append(replace(accuracy, is_usual=True))
     return FoundModel(model, path, "dimap", shape=shape, statements=tuple(stated))
 
 
