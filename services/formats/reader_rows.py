@@ -36,7 +36,7 @@ class Reader:
         name: of the kind of file, for people.
         functions: names of the public functions that read it.
         treatments: of all statements that such a file may make; one subject may have several.
-        never: subjects of which such a file cannot say anything, and which have no effect on its data.
+        never: subjects that such a file cannot state, and that have no effect on its data.
     """
 
     name: str

@@ -20,7 +20,7 @@ from amers.services.types import FloatImage, IntArray
 MOST_OPEN = 32
 """Tiles that are open at a time."""
 _SAME_PX = 0.01
-"""Tiles whose nodes lie so near those of the common grid are copied, others are interpolated."""
+"""Tiles with nodes this near to the nodes of the common grid are copied, others are interpolated."""
 _BORDER = 17
 """Positions along a side of a tile whose place in the common grid is computed."""
 

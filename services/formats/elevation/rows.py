@@ -67,7 +67,11 @@ GRID_READER = Reader(
         Treatment(Subject.HORIZONTAL_DATUM, "used", "of the format, the header or the `.prj` beside"),
         Treatment(Subject.HORIZONTAL_DATUM, "refused", "none; one without a usable transformation"),
         Treatment(Subject.VERTICAL_DATUM, "used", "as the caller states it"),
-        Treatment(Subject.VERTICAL_DATUM, "assumed", "EGM96 in `.hgt` and DTED, whose documents say so"),
+        Treatment(
+            Subject.VERTICAL_DATUM,
+            "assumed",
+            "EGM96 in `.hgt` and DTED, by the documents of these formats",
+        ),
         Treatment(Subject.VERTICAL_DATUM, "refused", "none, in the other formats"),
         Treatment(Subject.UNIT, "used", "of the format, or of the `.aux.xml` beside"),
         Treatment(Subject.UNIT, "assumed", "metres"),

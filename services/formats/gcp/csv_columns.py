@@ -9,7 +9,7 @@ from amers.services.formats.elevation.heights import unit_m
 from amers.services.statements import Subject
 
 ABOVE_SEA = "sea level"
-"""Datum of a head that says "above sea level" or "orthometric", but not of which geoid."""
+"""Datum of a head that says "above sea level" or "orthometric", without the name of a geoid."""
 ELLIPSOIDAL = "ellipsoid"
 
 

@@ -177,7 +177,7 @@ def parse_csv(
 
 @dataclass(frozen=True)
 class _Columns:
-    """The columns of a file: heads and places of those that are read, and heads of the others."""
+    """The columns of a file: heads and places of the columns that are read, and the other heads."""
 
     source: str
     heads: dict[str, Head]
