@@ -70,7 +70,7 @@ GRID_READER = Reader(
         Treatment(
             Subject.VERTICAL_DATUM,
             "assumed",
-            "EGM96 in `.hgt` and DTED, by the documents of these formats",
+            "EGM96 in `.hgt` and DTED, by their documents",
         ),
         Treatment(Subject.VERTICAL_DATUM, "refused", "none, in the other formats"),
         Treatment(Subject.UNIT, "used", "of the format, or of the `.aux.xml` beside"),

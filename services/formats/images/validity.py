@@ -222,7 +222,7 @@ def _is_alpha(path: FilePlace, dataset: rasterio.DatasetReader, band: int) -> bo
 
 
 def _bands_beside(path: FilePlace) -> list[tuple[int, ElementTree.Element]]:
-    """The bands in `NAME.aux.xml`, which GDAL writes next to images of formats that have no place for them."""
+    """The bands in `NAME.aux.xml`, where GDAL keeps what a format has no place for."""
     place = _beside(path, ".aux.xml")
     if place is None:
         return []
