@@ -167,7 +167,7 @@ def read_used_points(path: Path, stated: StatedByCaller = StatedByCaller()) -> M
 def read_or_missing(
     read: Callable[[Path, StatedByCaller], MarkedPoints], path: Path, stated: StatedByCaller
 ) -> tuple[MarkedPoints, list[InputError]]:
-    """The points of a file, and an error for each missing statement; with any, the ground cannot be used.
+    """The points of a file, and an error for each missing statement, with any of which it is unusable.
 
     Args:
         read: reads the file.
