@@ -206,7 +206,7 @@ MODELS = [
     modelled("that is empty", "scene_RPC.TXT", b""),
     modelled("of zeros", "scene_RPC.TXT", bytes(1000)),
     modelled("of random bytes", "scene_RPC.TXT", np.random.default_rng(1).bytes(2000)),
-    modelled("in UTF-16", "scene_RPC.TXT", rpc({}).encode("utf-16")),
+    modelled("in UTF-16 without a mark", "scene_RPC.TXT", rpc({}).encode("utf-16-le")),
     modelled("without a value", "LINE_SCALE", rpc({"LINE_SCALE": ""})),
     modelled("with a scale of zero", "scale", rpc({"LINE_SCALE": "0"})),
     modelled("with a scale NaN", "LINE_SCALE", rpc({"LINE_SCALE": "nan"})),
