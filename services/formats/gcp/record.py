@@ -1,6 +1,6 @@
 """The record of the statements of one file while it is read."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from amers.services.statements import Statement, Subject, Use
 
@@ -22,8 +22,9 @@ class Record:
         self.statements.append(Statement(self.file, subject, Use.USED, value, where, note))
 
     def assumed(self, subject: Subject, value: str, where: str = "", note: str = "") -> None:
-        """Note what the file does not state."""
-        self.statements.append(Statement(self.file, subject, Use.ASSUMED, value, where, note))
+        """Note what the file does not state; without a note it is as the documents of the format say."""
+        assumed = Statement(self.file, subject, Use.ASSUMED, value, where, note)
+        self.statements.append(replace(assumed, is_usual=not note))
 
     def not_used(self, subject: Subject, value: str, where: str = "", note: str = "") -> None:
         """Note a statement without effect."""
