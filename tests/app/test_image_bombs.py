@@ -245,7 +245,7 @@ def test_bombs_end_as_failed_jobs_within_their_limits(
         assert files == {"report.html", "report.json", "report.txt"}
 
 
-@pytest.mark.parametrize("suffix", [".ovr", ".msk", ".aux", ".vrt", ".png", ".hdr", ".lrc"])
+@pytest.mark.parametrize("suffix", [".ovr", ".aux", ".vrt", ".png", ".hdr", ".lrc"])
 def test_side_files_that_a_driver_would_follow_are_refused(store: Installation, suffix: str):
     me = store.headers["register"]
     scene = store.names["own_scene"]

@@ -325,4 +325,5 @@ def _read_adjusted(block: BlockToAssess, path: Path) -> Scene:
         raise InputError(
             f"{path}: {path.stem[:100]} is no image of the block; expected one of {names[:300]}"
         )
-    return read_scene(path, block.models[path.stem], sigma_m=1.0, crop_origin=(0.0, 0.0))
+    model = block.models[path.stem]
+    return read_scene(path, model, sigma_m=1.0, crop_origin=None if model is None else (0.0, 0.0))

@@ -16,8 +16,10 @@ from rasterio.enums import MaskFlags
 from rasterio.windows import Window as RasterWindow
 
 from amers.services.errors import FormatError
-from amers.services.formats.addresses import FilePlace
+from amers.services.formats.addresses import Address, FilePlace
 from amers.services.formats.images.datasets import as_format_error, open_dataset
+from amers.services.formats.images.layout import largest_piece_bytes
+from amers.services.formats.images.working_copy import MIB, READ_BY_WINDOWS_BYTES
 from amers.services.formats.text_files import parse_number, parse_xml, read_text
 from amers.services.statements import Statement, Statements, Subject, Use
 from amers.services.types import BoolArray
@@ -174,6 +176,13 @@ def _mask_beside(
         raise FormatError(
             f"{place}: {mask.height} x {mask.width} pixels found, {dataset.height} x {dataset.width} as "
             f"in {path.name} expected, whose mask it is by its name: remove or rename it"
+        )
+    piece = 0 if isinstance(place, Address) else largest_piece_bytes(place)
+    if piece > READ_BY_WINDOWS_BYTES:
+        mask.close()
+        raise FormatError(
+            f"{place}: strips or tiles of {piece // MIB} MiB found, at most "
+            f"{READ_BY_WINDOWS_BYTES // MIB} MiB expected of a mask: write it in tiles"
         )
     flags = [mask.tags().get(f"INTERNAL_MASK_FLAGS_{band}", "") for band in dataset.indexes]
     if any(flag.isdecimal() and int(flag) & _PER_DATASET for flag in flags):

@@ -282,6 +282,23 @@ def msk_of_another_size(folder: Path) -> RasterImage:
     return open_raster(path)
 
 
+@cell(PIXELS, Subject.VALIDITY, "refused", "strips or tiles of 17 MiB found")
+def msk_of_one_large_strip(folder: Path) -> RasterImage:
+    """A small file that would fill the memory of everyone who reads a window of it."""
+    large = np.ones((4200, 4300), dtype=bool)
+    path = write(folder / "a.tif", [large * 7], dtype="uint8", tiled=True, compress="deflate")
+    place = write(
+        folder / "mask.tif",
+        [large * 255],
+        dtype="uint8",
+        on_map=False,
+        compress="deflate",
+        blockysize=4200,
+    )
+    place.rename(folder / "a.tif.msk")
+    return open_raster(path)
+
+
 @cell(PIXELS, Subject.BANDS, "used", "a.tif, band 1: bands: colour table: used")
 def colour_table(folder: Path) -> RasterImage:
     """Its indices say nothing of the brightness."""
