@@ -243,6 +243,7 @@ def test_gdal_reads_an_image_of_a_scene_by_ranges(
     content = (tmp_path / "a.tif").read_bytes()
     scene = world.client.post("/scenes?name=large.tif", content=content).json()["id"]
     caplog.set_level(logging.INFO, "amers.requests")
+    caplog.clear()
     authorization = f"Authorization: Bearer {world.client.headers['Authorization'].split()[1]}"
     with listening(world.app) as url:
         address = f"{url}/scenes/{scene}/files/large.tif"

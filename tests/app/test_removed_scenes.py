@@ -20,7 +20,7 @@ from tests.app.job_queue import claimed, state_of
 @pytest.mark.parametrize(
     ("process", "module", "step"),
     [
-        ("view-scene", scene_view, "open_raster"),
+        ("view-scene", scene_view, "open_image"),
         ("view-scene", scene_view, "local_image"),
         ("register-scene", registration_job, "local_image"),
         ("register-scene", registration_job, "run_registration"),

@@ -109,7 +109,8 @@ def frame_error_m(block: BlockAdjustment, base: BlockAdjustment, without: Array)
 def test_the_frame_of_another_pair_follows_its_control(triplet: Triplet, base: BlockAdjustment) -> None:
     images, observations = triplet.pair(1, 2)
     free = adjust_block(images, observations)
-    assert free.frames[0].sigma_m > 20.0
+    # That of Pléiades by the documents beside the images: 8.5 m CE90.
+    assert free.frames[0].sigma_m > 3.0 * FRAME.sigma_m
     squares = []
     for trial in range(trials):
         known, injected_m = control(base, np.random.default_rng([8, trial]))
