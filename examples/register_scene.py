@@ -14,7 +14,7 @@ import simulated_images
 
 from amers.services.formats.block.reader import FolderChips, read_block
 from amers.services.formats.images.scenes import read_scene
-from amers.services.formats.sensor_models.refined_model import write_refined
+from amers.services.formats.sensor_models.refined_model import ImageFiles, write_refined
 from amers.services.registration.on_points import register_scene
 
 
@@ -46,7 +46,12 @@ def register(image: Path, block_folder: Path, folder: Path) -> None:
     model, adjustment = registration.model, registration.adjustment
     # All points of one block share its frame; the errors of the model on the Earth include it.
     refined = write_refined(
-        image, None, model, adjustment, shape=scene.image.shape, folder=folder, frame=points.frames[0]
+        ImageFiles(image),
+        model,
+        adjustment,
+        shape=scene.image.shape,
+        folder=folder,
+        frame=points.frames[0],
     )
     print(f"{refined.note}: {', '.join(path.name for path in refined.files)}")
 
