@@ -9,6 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+MIB = 1 << 20
+READ_BY_WINDOWS_BYTES = 16 * MIB
+"""Largest strip or tile that is unpacked for each window: a quarter of the cache of GDAL."""
 MOST_DIRECTORIES = 1000
 MOST_ENTRIES = 1000
 """More than any product has in one directory; entries are ordered by their tag, and ours are small."""

@@ -18,8 +18,7 @@ from rasterio.windows import Window as RasterWindow
 from amers.services.errors import FormatError
 from amers.services.formats.addresses import Address, FilePlace
 from amers.services.formats.images.datasets import as_format_error, open_dataset
-from amers.services.formats.images.layout import largest_piece_bytes
-from amers.services.formats.images.working_copy import MIB, READ_BY_WINDOWS_BYTES
+from amers.services.formats.images.layout import MIB, READ_BY_WINDOWS_BYTES, largest_piece_bytes
 from amers.services.formats.text_files import parse_number, parse_xml, read_text
 from amers.services.statements import Statement, Statements, Subject, Use
 from amers.services.types import BoolArray

@@ -14,11 +14,8 @@ import rasterio.shutil
 from amers.services.errors import FormatError
 from amers.services.formats.addresses import Address, FilePlace
 from amers.services.formats.images.datasets import GDAL_OPTIONS, as_format_error
-from amers.services.formats.images.layout import largest_piece_bytes
+from amers.services.formats.images.layout import MIB, READ_BY_WINDOWS_BYTES, largest_piece_bytes
 
-MIB = 1 << 20
-READ_BY_WINDOWS_BYTES = 16 * MIB
-"""Largest strip or tile that is unpacked for each window: a quarter of the cache."""
 LARGEST_PIECE_BYTES = 1024 * MIB
 """Largest strip or tile of an image: it is unpacked in memory."""
 LARGEST_COPY_BYTES = 4096 * MIB
