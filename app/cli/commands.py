@@ -93,6 +93,16 @@ COMMANDS: Tree = {
             ),
         },
     ),
+    "surface": Group(
+        "Surfaces: heights of the ground and of what stands on it.",
+        {
+            "make": Command(
+                "surface:make",
+                "Make the surface that overlapping registered scenes show: heights with their accuracy, "
+                "on a map.",
+            ),
+        },
+    ),
     "vectors": Group(
         "Vectors digitised on raw scenes, onto the map and back.",
         {

@@ -40,7 +40,7 @@ from amers.app.usecases.terrain_file import TerrainFile, read_terrain
 from amers.services.errors import CoverageError
 from amers.services.formats.elevation.geoid import vertical_crs
 from amers.services.formats.images.bands import one_band
-from amers.services.formats.images.ortho import write_cog
+from amers.services.formats.images.ortho import BandForm, write_cog
 from amers.services.formats.images.raster import RasterImage
 from amers.services.formats.images.scenes import read_scene
 from amers.services.formats.images.tiled_image import SceneImage, TiledImage
@@ -240,9 +240,7 @@ def run_orthorectification(
     counter = _DataPixels(partial(unseen, scene, ground))
     windows = counter.count(orthorectify(bands, scene.model, ground, grid, options, progress=progress))
     saturated = next(reversed(raster.saturated_values(1)), None)
-    error_px = write_cog(
-        output, grid, windows, bands=len(bands), dtype=dtype, nodata=nodata, saturated=saturated
-    )
+    error_px = write_cog(output, grid, windows, BandForm(len(bands), dtype, nodata, saturated))
     raster.close()
     lines, samples = grid.shape
     return Orthorectified(

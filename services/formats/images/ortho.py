@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
@@ -78,16 +79,29 @@ def write_refined_ortho(image_path: Path, grid: MapGrid, folder: Path, copy: boo
     return [sidecar, target]
 
 
-def write_cog(
-    path: Path,
-    grid: MapGrid,
-    windows: Iterable[OrthoWindow],
-    *,
-    bands: int,
-    dtype: str,
-    nodata: float,
-    saturated: int | None = None,
-) -> float:
+@dataclass(frozen=True)
+class BandForm:
+    """The bands of a file.
+
+    Attributes:
+        bands: their number.
+        dtype: type of the pixels: uint8, uint16, int16 or float32.
+        nodata: value of pixels without data.
+        saturated: value of saturated pixels; None takes the largest of the type.
+        names, units: of the bands, all or none.
+        overviews: how they are made: AVERAGE, or NEAREST for values of which there is no mean.
+    """
+
+    bands: int
+    dtype: str
+    nodata: float
+    saturated: int | None = None
+    names: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
+    overviews: str = "AVERAGE"
+
+
+def write_cog(path: Path, grid: MapGrid, windows: Iterable[OrthoWindow], form: BandForm) -> float:
     """Write an ortho-image as a cloud-optimised GeoTIFF with overviews, window by window.
 
     Integer pixels are rounded and clipped to the range of their type; a valid pixel never has the values
@@ -97,10 +111,7 @@ def write_cog(
         path: the file; an existing one is replaced when the new one is complete.
         grid: the map grid.
         windows: all windows of the grid, in any order.
-        bands: number of bands.
-        dtype: type of the pixels: uint8, uint16, int16 or float32.
-        nodata: value of pixels outside the scene.
-        saturated: value of saturated pixels; by default the largest of the type.
+        form: of the bands.
 
     Returns:
         The largest `error_px` of the windows, in pixels.
@@ -112,8 +123,8 @@ def write_cog(
     tiled, complete = (path.with_name(f".{path.name}.{end}") for end in ("tiled", "complete"))
     try:
         with as_format_error(path, "a writable file"), rasterio.Env(**GDAL_OPTIONS):
-            error_px = _write_windows(tiled, windows, _profile(grid, bands, dtype, nodata), saturated)
-            predictor = "FLOATING_POINT" if dtype == "float32" else "STANDARD"
+            error_px = _write_windows(tiled, windows, grid, form)
+            predictor = "FLOATING_POINT" if form.dtype == "float32" else "STANDARD"
             rasterio.shutil.copy(
                 tiled,
                 complete,
@@ -121,7 +132,7 @@ def write_cog(
                 COMPRESS="DEFLATE",
                 LEVEL=1,
                 PREDICTOR=predictor,
-                OVERVIEW_RESAMPLING="AVERAGE",
+                OVERVIEW_RESAMPLING=form.overviews,
                 BIGTIFF="IF_SAFER",
             )
         complete.replace(path)
@@ -131,17 +142,17 @@ def write_cog(
     return error_px
 
 
-def _profile(grid: MapGrid, bands: int, dtype: str, nodata: float) -> dict[str, Any]:
+def _profile(grid: MapGrid, form: BandForm) -> dict[str, Any]:
     """How a GeoTIFF in tiles is created."""
     return {
         "driver": "GTiff",
         "height": grid.shape[0],
         "width": grid.shape[1],
-        "count": bands,
-        "dtype": dtype,
+        "count": form.bands,
+        "dtype": form.dtype,
         "crs": grid.crs,
         "transform": gdal_transform(grid),
-        "nodata": nodata,
+        "nodata": form.nodata,
         "tiled": True,
         "blockxsize": 512,
         "blockysize": 512,
@@ -149,17 +160,19 @@ def _profile(grid: MapGrid, bands: int, dtype: str, nodata: float) -> dict[str, 
     }
 
 
-def _write_windows(
-    path: Path, windows: Iterable[OrthoWindow], profile: dict[str, Any], saturated: int | None
-) -> float:
+def _write_windows(path: Path, windows: Iterable[OrthoWindow], grid: MapGrid, form: BandForm) -> float:
     """Write the windows into a new file; returns their largest error."""
     error_px = 0.0
-    with rasterio.open(path, "w", **profile) as file:
+    with rasterio.open(path, "w", **_profile(grid, form)) as file:
+        for band, name in enumerate(form.names, start=1):
+            file.set_band_description(band, name)
+        for band, unit in enumerate(form.units, start=1):
+            file.set_band_unit(band, unit)
         for ortho in windows:
             w = ortho.window
             target = RasterWindow(w.sample, w.line, w.samples, w.lines)
-            dtype, nodata = np.dtype(profile["dtype"]), profile["nodata"]
-            file.write(_encoded(ortho.pixels, dtype, nodata, saturated), window=target)
+            pixels = _encoded(ortho.pixels, np.dtype(form.dtype), form.nodata, form.saturated)
+            file.write(pixels, window=target)
             error_px = max(error_px, ortho.error_px)
     return error_px
 

@@ -9,7 +9,7 @@ import pytest
 import rasterio
 
 from amers.services.errors import ComputationError, CoverageError
-from amers.services.formats.images.ortho import write_cog
+from amers.services.formats.images.ortho import BandForm, write_cog
 from amers.services.geodesy import metres_per_degree_at
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage
@@ -343,7 +343,7 @@ def test_an_ortho_image_is_a_cloud_optimised_geotiff_with_overviews(tmp_path: Pa
     grid = choose_grid(scene(), ground)
     windows = list(orthorectify(ramps(), scene().model, ground, grid))
     path = tmp_path / "ortho.tif"
-    error_px = write_cog(path, grid, windows, bands=2, dtype="uint16", nodata=0.0)
+    error_px = write_cog(path, grid, windows, BandForm(2, "uint16", 0.0))
     assert error_px == max(window.error_px for window in windows)
     assert [file.name for file in tmp_path.iterdir()] == ["ortho.tif"]
     with rasterio.open(path) as file:
@@ -374,10 +374,7 @@ def test_saturated_pixels_are_written_as_the_saturated_value(
         path,
         grid,
         [OrthoWindow(Window(0, 0, 1, 6), row, 0.0)],
-        bands=1,
-        dtype=dtype,
-        nodata=0.0,
-        saturated=saturated,
+        BandForm(1, dtype, 0.0, saturated),
     )
     with rasterio.open(path) as file:
         stored = file.read(1)[0].tolist()

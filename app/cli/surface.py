@@ -1,0 +1,92 @@
+"""`amers surface make`: the surface that overlapping scenes show, as heights on a map."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from amers.app.cli.image_production import WorkOptions
+from amers.app.cli.options import Shown
+from amers.app.cli.output import AsJson, show_one
+from amers.app.cli.production_rows import effort_row
+from amers.app.cli.progress import shown_progress
+from amers.app.errors import InputError
+from amers.app.usecases.executors import ComputeOptions
+from amers.app.usecases.image_production import WorkPlace
+from amers.app.usecases.surface import SurfaceFiles, run_surface
+from amers.services.surface.options import SurfaceOptions
+
+Files = Annotated[SurfaceFiles, Shown(images=typer.Argument(exists=True), registered=None, block=None)]
+
+
+@dataclass(frozen=True)
+class MadeOptions:
+    """How the surface is made.
+
+    Attributes:
+        gsd_m: side of a cell, metres; by default the ground sampling of the finest image.
+        heights_m: lowest and highest surface above the ellipsoid: LOW,HIGH, metres; by default the
+            heights that the models are meant for.
+        pairs: number of pairs of images at most.
+        fill_cells: gaps are filled from heights at most this many cells away.
+    """
+
+    gsd_m: Annotated[float | None, typer.Option(min=0.01)] = None
+    heights_m: str | None = None
+    pairs: Annotated[int, typer.Option(min=1)] = 6
+    fill_cells: Annotated[int, typer.Option(min=0, max=20)] = 3
+
+    def options(self) -> SurfaceOptions:
+        """The same as the service takes it.
+
+        Raises:
+            InputError: the heights are not two numbers in their order.
+        """
+        heights_m = None if self.heights_m is None else _range(self.heights_m)
+        return SurfaceOptions(self.gsd_m, heights_m, self.pairs, fill_cells=self.fill_cells)
+
+
+def make(
+    *,
+    files: Files,
+    output: Annotated[Path, typer.Option("-o", "--output", help="GeoTIFF to write.")],
+    made: MadeOptions,
+    place: WorkOptions,
+    as_json: AsJson = False,
+) -> None:
+    """Make the surface that overlapping registered scenes show: heights with their accuracy, on a map.
+
+    The file has four bands: height above the ellipsoid and its standard deviation in metres, number of
+    images, and a number for the reason why a cell has no height. The models of the scenes have to agree:
+    register them together first (--registered), or give the block that was made from them (--block).
+    """
+    with shown_progress() as progress:
+        surface = run_surface(
+            files,
+            output,
+            made.options(),
+            place=WorkPlace(place.work, ComputeOptions(place.jobs, place.cluster)),
+            progress=progress,
+        )
+    record = asdict(surface)
+    record |= effort_row(surface.effort, as_json=as_json)
+    record.pop("effort")
+    if not as_json:
+        record["pairs"] = [
+            f"{' + '.join(pair['images'])} (B/H {pair['base_to_height']:.2f}, sigma "
+            f"{pair['sigma_m']:.2f} m)"
+            for pair in surface.pairs
+        ]
+        record["cells"] = [f"{label}: {count:,}" for label, count in surface.cells.items()]
+    show_one(record, as_json=as_json)
+
+
+def _range(text: str) -> tuple[float, float]:
+    try:
+        low, high = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError(f"--heights-m: {text} found, LOW,HIGH in metres expected") from None
+    if not low < high:
+        raise InputError(f"--heights-m: {text} found, the lower height first expected")
+    return low, high

@@ -1,0 +1,261 @@
+"""Make a surface from scenes in files: read them with their refined models, write a GeoTIFF."""
+
+import hashlib
+import pickle
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pyproj import CRS
+
+from amers.app.errors import InputError
+from amers.app.usecases.executors import open_executor
+from amers.app.usecases.image_production import WorkPlace
+from amers.app.usecases.registered_scene import SceneModel, read_registered_scene
+from amers.services.formats.block.reader import block_member, read_document
+from amers.services.formats.images.ortho import BandForm, write_cog
+from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.work_folder import WorkFolder
+from amers.services.imagery.scene import Scene
+from amers.services.map_grid import MapGrid
+from amers.services.orthorectification.rectify import OrthoWindow
+from amers.services.sensors.ortho import OrthoModel
+from amers.services.statements import Statements, gathered
+from amers.services.surface.match import REASON_LABELS, Reason
+from amers.services.surface.options import SurfaceOptions
+from amers.services.surface.surface import Surface, SurfaceTile, make_surface, surface_tiles
+from amers.services.tasks import Effort, Work
+from amers.services.types import Progress, no_progress, part_of
+
+BANDS = ("height_m", "sigma_m", "views", "reason")
+"""Bands of the file of a surface."""
+
+
+@dataclass(frozen=True)
+class SurfaceFiles:
+    """The files that a surface is made from.
+
+    Attributes:
+        images: two or more images of the same ground.
+        registered: folder with the registrations of the images, one folder each, as `amers scene
+            register-many -o` writes it.
+        block: folder of a block that was made from the images, whose adjusted models are used.
+    """
+
+    images: tuple[Path, ...]
+    registered: Path | None = None
+    block: Path | None = None
+
+
+@dataclass(frozen=True)
+class SurfaceFile:
+    """A surface that was written.
+
+    Attributes:
+        path: of the GeoTIFF.
+        crs: of its map, with heights above the ellipsoid.
+        lines, samples: its size.
+        gsd_m: side of a cell, metres.
+        pairs: what it was made of: names of the images, base over height, shift onto the others (x, y,
+            height in metres), and noise of the heights in metres.
+        cells: number of cells by why they have no height, or that they have one.
+        sigma_m: median of the standard deviations of the heights.
+        effort: what every stage took.
+        statements: of the files of the scenes.
+    """
+
+    path: Path
+    crs: str
+    lines: int
+    samples: int
+    gsd_m: float
+    pairs: tuple[dict[str, Any], ...]
+    cells: dict[str, int]
+    sigma_m: float
+    effort: dict[str, Effort] = field(default_factory=dict)
+    statements: Statements = ()
+
+    def __repr__(self) -> str:
+        share = self.cells.get(REASON_LABELS[Reason.FOUND], 0) / (self.lines * self.samples)
+        return (
+            f"SurfaceFile {self.path}: {self.crs}\n"
+            f"  {self.lines} x {self.samples} cells of {self.gsd_m:.2f} m, {100.0 * share:.0f} % with a "
+            f"height, from {len(self.pairs)} pairs of images\n"
+            f"  sigma of the heights: {self.sigma_m:.2f} m (median)"
+        )
+
+
+def run_surface(
+    files: SurfaceFiles,
+    output: Path,
+    options: SurfaceOptions,
+    *,
+    place: WorkPlace,
+    progress: Progress = no_progress,
+) -> SurfaceFile:
+    """Make a surface and write it as a cloud-optimised GeoTIFF with the bands of `BANDS`.
+
+    Args:
+        files: of the scenes.
+        output: the file; an existing one is replaced when the new one is complete.
+        options: of the surface.
+        place: where the work is done. Without a folder of its own, results of tasks are kept next to the
+            output until the file is complete, so that an interrupted work continues.
+        progress: receives the fraction done and a message.
+
+    Raises:
+        InputError: a file cannot be used.
+        CoverageError: the scenes do not show the same ground, or nothing of it was matched.
+    """
+    if len(files.images) < 2:
+        raise InputError(
+            f"{len(files.images)} image found; a surface needs two or more of the same ground"
+        )
+    if output.resolve() in [path.resolve() for path in files.images]:
+        raise InputError(f"{output}: the output would replace an image; choose another name")
+    with ExitStack() as stack:
+        scenes = [_scene(image, files, stack) for image in files.images]
+        folder = place.folder or output.with_name(f"{output.name}.work")
+        kept = WorkFolder(folder, _inputs(files, scenes, options))
+        executor, ahead = stack.enter_context(open_executor(place.compute))
+        work = Work(executor, kept, ahead)
+        surface = make_surface(scenes, options, work=work, progress=part_of(progress, 0.0, 0.85))
+        counter = _Cells()
+        tiles = counter.count(surface_tiles(surface, part_of(progress, 0.85, 0.15)))
+        crs = heights_crs(surface.grid)
+        write_cog(
+            output,
+            MapGrid(crs, surface.grid.origin_xy, surface.grid.step_xy, surface.grid.shape),
+            _windows(tiles),
+            BandForm(
+                len(BANDS),
+                "float32",
+                float("nan"),
+                names=BANDS,
+                units=("metre", "metre", "", ""),
+                overviews="NEAREST",
+            ),
+        )
+    if place.folder is None:
+        shutil.rmtree(folder)
+    lines, samples = surface.grid.shape
+    return SurfaceFile(
+        output,
+        surface.grid.crs,
+        lines,
+        samples,
+        float(surface.grid.step_xy[0, 1]),
+        tuple(_pairs(surface, scenes)),
+        counter.by_label(lines * samples),
+        counter.median_sigma_m,
+        dict(work.effort),
+        gathered(one for scene in scenes for one in scene.statements),
+    )
+
+
+@dataclass
+class _Cells:
+    """Counts the cells of tiles on their way into the file."""
+
+    reasons: np.ndarray = field(default_factory=lambda: np.zeros(len(Reason), dtype=np.int64))
+    sigmas_m: list[float] = field(default_factory=list)
+
+    def count(self, tiles: Iterator[SurfaceTile]) -> Iterator[SurfaceTile]:
+        for tile in tiles:
+            self.reasons += np.bincount(tile.reason.ravel(), minlength=len(Reason))
+            known = tile.sigma_m[np.isfinite(tile.sigma_m)]
+            if len(known):
+                self.sigmas_m.append(float(np.median(known)))
+            yield tile
+
+    @property
+    def median_sigma_m(self) -> float:
+        """Median of the medians of the tiles; NaN without any height."""
+        return float(np.median(self.sigmas_m)) if self.sigmas_m else float("nan")
+
+    def by_label(self, n_cells: int) -> dict[str, int]:
+        """Number of cells by reason; those of no tile are outside of what was matched."""
+        self.reasons[Reason.OUTSIDE] += n_cells - int(self.reasons.sum())
+        counts = zip(Reason, self.reasons.tolist(), strict=True)
+        return {REASON_LABELS[reason]: count for reason, count in counts if count}
+
+
+def heights_crs(grid: MapGrid) -> str:
+    """The reference system of a grid with heights above the ellipsoid, as WKT.
+
+    GeoTIFF cannot say this of a map; a vertical system of this name can be written, and is read again.
+    """
+    horizontal = CRS.from_user_input(grid.crs)
+    return (
+        f'COMPOUNDCRS["{horizontal.name} + ellipsoidal height",{horizontal.to_wkt("WKT2_2019")},'
+        'VERTCRS["WGS 84 ellipsoidal height",VDATUM["WGS 84 ellipsoid"],CS[vertical,1],'
+        'AXIS["up",up,LENGTHUNIT["metre",1]]]]'
+    )
+
+
+def _windows(tiles: Iterator[SurfaceTile]) -> Iterator[OrthoWindow]:
+    for tile in tiles:
+        bands = (tile.height_m, tile.sigma_m, tile.views, tile.reason)
+        yield OrthoWindow(tile.window, np.stack(bands).astype(np.float32), 0.0)
+
+
+def _scene(image: Path, files: SurfaceFiles, stack: ExitStack) -> Scene:
+    """A scene with its refined model, open until the stack closes."""
+    if files.registered is not None:
+        registration = files.registered / image.stem
+        scene, _ = read_registered_scene(SceneModel(image, registration=registration))
+    elif files.block is not None:
+        scene = read_scene(image, _adjusted_model(files.block, image), sigma_m=1.0)
+    else:
+        scene = read_scene(image, sigma_m=1.0)
+    stack.callback(scene.image.close)  # type: ignore[attr-defined]
+    if isinstance(scene.model, OrthoModel):
+        raise InputError(
+            f"{image}: an ortho-image on a map found, which has no parallax; an image with a sensor "
+            "model is expected"
+        )
+    return scene
+
+
+def _adjusted_model(block: Path, image: Path) -> Path:
+    """The file of the adjusted model of an image of a block."""
+    document = read_document(block)
+    for one, model in zip(document.images, document.models, strict=True):
+        if one.image_id in (image.stem, image.name) and model is not None:
+            return block_member(block, model)
+    known = ", ".join(one.image_id for one in document.images[:5])
+    raise InputError(f"{image}: no image of {block} with an adjusted model; its images: {known}")
+
+
+def _inputs(files: SurfaceFiles, scenes: Sequence[Scene], options: SurfaceOptions) -> dict[str, Any]:
+    """What the results of all tasks depend on."""
+    facts = [image.stat() for image in files.images]
+    return {
+        "version": version("amers"),
+        "images": [
+            {
+                "file": str(image.resolve()),
+                "bytes": fact.st_size,
+                "modified": fact.st_mtime_ns,
+                "model": hashlib.sha256(pickle.dumps(scene.model)).hexdigest(),
+            }
+            for image, fact, scene in zip(files.images, facts, scenes, strict=True)
+        ],
+        "options": asdict(options),
+    }
+
+
+def _pairs(surface: Surface, scenes: Sequence[Scene]) -> Iterator[dict[str, Any]]:
+    names = [scene.acquisition.image_id for scene in scenes]
+    for pair, shift_m, sigma_m in zip(surface.pairs, surface.shift_m, surface.sigma_m, strict=True):
+        yield {
+            "images": [names[pair.first], names[pair.second]],
+            "base_to_height": round(pair.base_to_height, 3),
+            "shift_m": [round(float(value), 3) for value in shift_m],
+            "sigma_m": round(float(sigma_m), 3),
+        }

@@ -1,0 +1,193 @@
+"""Surfaces of several pairs made one: each pair aligned to their median, heights weighted, with a sigma.
+
+Pairs of one block disagree by decimetres to metres, the more the shorter their base, by errors of their
+models along the rows. Each pair is therefore shifted onto the median of all. Source of the shift in
+position: Nuth and Kääb (2011), Co-registration and bias corrections of satellite elevation data sets.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from amers.services.types import Array, BoolArray, FloatImage, IntArray
+
+DISPARITY_SIGMA_PX = 0.25
+"""Noise of a disparity on flat ground, one standard deviation: 0.24 to 0.29 px for pairs of WorldView-3
+images of a town against lidar (benchmarks/surface.py)."""
+_SHARED = 0.5
+"""Correlation of the noise of two pairs with a common image: half of the noise is of that image."""
+_STEEPEST = 1.0
+"""Slopes above this, as steps of walls, do not align: a height there is of either side."""
+_MAX_MISFIT_M = 2.0
+DISTANCE_M, DISTANCES = 0.02, 100
+"""Steps of the distances that are counted, up to the largest misfit."""
+_AROUND_CELLS = 9
+"""Side of the square around a cell whose roughness counts, cells."""
+_SAME_M = 1.0
+"""Heights of pairs that differ by less are of one surface."""
+Views = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Fused:
+    """A surface made of several pairs.
+
+    Attributes:
+        height_m: (lines, samples) above the ellipsoid; NaN where no pair has one.
+        sigma_m: (lines, samples) one standard deviation of it.
+        views: (lines, samples) uint8, number of images that it was found in.
+    """
+
+    height_m: FloatImage
+    sigma_m: FloatImage
+    views: Views
+
+
+def fuse(heights: FloatImage, sigma_m: Array, pairs: IntArray) -> Fused:
+    """The surface of several pairs that are aligned.
+
+    Args:
+        heights: (p, lines, samples); NaN where a pair has none.
+        sigma_m: (p,) noise of the heights of each pair, one standard deviation.
+        pairs: (p, 2) numbers of their images.
+    """
+    height_m, variance, views = _fused(heights, sigma_m, pairs)
+    sigma = np.sqrt(variance + roughness_m(height_m) ** 2)
+    return Fused(height_m, sigma.astype(np.float32), views)
+
+
+def roughness_m(height_m: FloatImage) -> FloatImage:
+    """Standard deviation (lines, samples) of the heights around a cell from the plane through them.
+
+    Heights next to a wall may be those of its other side, and crowns of trees are blurred: by as much as
+    the heights around vary, as lidar shows (benchmarks/surface.py).
+    """
+    known = np.isfinite(height_m)
+    level = float(np.mean(height_m[known])) if known.any() else 0.0
+    valid = known.astype(np.float32)
+    above = np.where(known, height_m - level, 0.0).astype(np.float32)
+    axis = np.arange(_AROUND_CELLS, dtype=np.float64) - _AROUND_CELLS // 2
+    one = np.ones_like(axis)
+
+    def total(values: FloatImage, along: Array, across: Array) -> FloatImage:
+        return np.asarray(cv2.sepFilter2D(values, cv2.CV_32F, along, across))
+
+    count = np.maximum(total(valid, one, one), 1.0)
+    mean = total(above, one, one) / count
+    variance = total(above * above, one, one) / count - mean * mean
+    for along, across in ((axis, one), (one, axis)):
+        position = total(valid, along, across) / count
+        of_position = total(valid, along * along, across * across) / count - position**2
+        product = total(above, along, across) / count - mean * position
+        variance -= product**2 / np.maximum(of_position, 1e-6)
+    return np.sqrt(np.maximum(variance, 0.0))
+
+
+def noise_of_distances(distances: IntArray) -> Array:
+    """Standard deviation (p,) by the median of distances that `alignment_sums` counts; 0 for none."""
+    below = np.cumsum(distances, axis=1)
+    median = (below < below[:, -1:] / 2.0).sum(axis=1) * DISTANCE_M
+    return np.asarray(1.4826 * median)
+
+
+@njit(cache=True)
+def alignment_sums(
+    heights: FloatImage, middle: FloatImage, step_m: float
+) -> tuple[Array, Array, IntArray]:
+    """What tells how pairs lie off a surface on a tile.
+
+    Args:
+        heights: (p, lines, samples) of the pairs.
+        middle: (lines, samples) the surface.
+        step_m: side of a cell.
+
+    Returns:
+        Normal equations (p, 3, 3) and (p, 3) of the shifts that bring the pairs onto the surface, and
+        numbers (p, 100) of cells by their distance from it, in steps of 2 cm.
+    """
+    count, lines, samples = heights.shape
+    normal, right = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    distances = np.zeros((count, DISTANCES), dtype=np.int64)
+    row = np.empty(3)
+    for i in range(1, lines - 1):
+        for j in range(1, samples - 1):
+            east = (middle[i, j + 1] - middle[i, j - 1]) / (2.0 * step_m)
+            north = (middle[i - 1, j] - middle[i + 1, j]) / (2.0 * step_m)
+            if not (abs(east) < _STEEPEST and abs(north) < _STEEPEST):
+                continue
+            row[0], row[1], row[2] = -east, -north, 1.0
+            for p in range(count):
+                misfit = middle[i, j] - heights[p, i, j]
+                if not abs(misfit) < _MAX_MISFIT_M:
+                    continue
+                distances[p, int(abs(misfit) / DISTANCE_M)] += 1
+                weight = 1.0 / (1.0 + (misfit / 0.3) ** 2)
+                for k in range(3):
+                    right[p, k] += weight * row[k] * misfit
+                    for m in range(3):
+                        normal[p, k, m] += weight * row[k] * row[m]
+    return normal, right, distances
+
+
+@njit(cache=True)
+def _fused(heights: FloatImage, sigma_m: Array, pairs: IntArray) -> tuple[FloatImage, FloatImage, Views]:
+    count, lines, samples = heights.shape
+    out = np.full((lines, samples), np.nan, dtype=np.float32)
+    variance = np.full((lines, samples), np.nan, dtype=np.float32)
+    views = np.zeros((lines, samples), dtype=np.uint8)
+    weight = 1.0 / sigma_m**2
+    for i in range(lines):
+        for j in range(samples):
+            values = heights[:, i, j]
+            known = np.isfinite(values)
+            if not known.any():
+                continue
+            middle = _weighted_median(values, weight, known)
+            used = known & (np.abs(values - middle) <= np.maximum(_SAME_M, 3.0 * sigma_m))
+            own = np.where(used, weight, 0.0)
+            mean = 0.0
+            for p in range(count):
+                mean += own[p] * values[p] if used[p] else 0.0
+            mean /= own.sum()
+            scatter = 0.0
+            for p in range(count):
+                scatter += own[p] * (values[p] - mean) ** 2 if used[p] else 0.0
+            scatter /= own.sum() * max(used.sum() - 1, 1)
+            # Pairs that do not agree with the middle show another surface: they widen the sigma.
+            apart = 1.0 - own.sum() / weight[known].sum()
+            out[i, j] = mean
+            variance[i, j] = _noise(sigma_m, pairs, used) + scatter + apart * _SAME_M**2
+            views[i, j] = _number_of_images(pairs, used)
+    return out, variance, views
+
+
+@njit(cache=True)
+def _weighted_median(values: FloatImage, weight: Array, known: BoolArray) -> float:
+    half = weight[known].sum() / 2.0
+    below = 0.0
+    for p in np.argsort(values):  # unknown ones, which are NaN, come last
+        below += weight[p]
+        if below >= half:
+            return float(values[p])
+    return np.nan
+
+
+@njit(cache=True)
+def _noise(sigma_m: Array, pairs: IntArray, used: BoolArray) -> float:
+    """Variance of the weighted mean of pairs, some of which share an image."""
+    total, weight = 0.0, 0.0
+    for p in np.flatnonzero(used):
+        weight += sigma_m[p] ** -2.0
+        for q in np.flatnonzero(used):
+            shared = pairs[p, 0] in pairs[q] or pairs[p, 1] in pairs[q]
+            correlation = 1.0 if p == q else (_SHARED if shared else 0.0)
+            total += correlation / (sigma_m[p] * sigma_m[q])
+    return float(total / weight**2)
+
+
+@njit(cache=True)
+def _number_of_images(pairs: IntArray, used: BoolArray) -> int:
+    return len(np.unique(pairs[used].copy().ravel()))

@@ -1,0 +1,27 @@
+"""Options of a surface."""
+
+from dataclasses import dataclass, field
+
+from amers.services.surface.match import SemiGlobal
+
+
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """How a surface is made.
+
+    Attributes:
+        gsd_m: side of a cell, metres; None takes the ground sampling of the finest image.
+        heights_m: lowest and highest surface above the ellipsoid, metres; None takes the heights that
+            the models are meant for.
+        pairs: number of pairs at most.
+        bases: least and largest base over height of a pair.
+        fill_cells: gaps are filled from heights at most this many cells away.
+        matcher: finds the disparities.
+    """
+
+    gsd_m: float | None = None
+    heights_m: tuple[float, float] | None = None
+    pairs: int = 6
+    bases: tuple[float, float] = (0.12, 0.9)
+    fill_cells: int = 3
+    matcher: SemiGlobal = field(default_factory=SemiGlobal)

@@ -1,0 +1,202 @@
+"""The stages of a surface: pairs matched, aligned and fused, each in tasks of one tile."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import cv2
+import numpy as np
+
+from amers.services.imagery.scene import Scene
+from amers.services.map_grid import MapGrid
+from amers.services.surface.fuse import (
+    DISPARITY_SIGMA_PX,
+    DISTANCES,
+    alignment_sums,
+    fuse,
+    noise_of_distances,
+)
+from amers.services.surface.match import Reason, Reasons
+from amers.services.surface.options import SurfaceOptions
+from amers.services.surface.pair_surface import PairSurface, cells_of_pair, match_task, pair_surface
+from amers.services.surface.pairs import Pair
+from amers.services.surface.tiles import MARGIN_CELLS, Tile, part_of_grid
+from amers.services.tasks import Arrays, Work
+from amers.services.types import Array, FloatImage, IntArray, Progress, part_of
+
+_REACH_CELLS = 1.5
+"""Distance of the points around a cell of which the median is its height."""
+_NEIGHBOURS = 3
+"""Cells with a height around one that is filled."""
+_ROUNDS = 3
+"""Rounds of alignment: offsets first, then positions."""
+_FEWEST_CELLS = 1000
+"""Cells that have to agree before a pair is moved."""
+
+
+@dataclass(frozen=True)
+class Stages:
+    """What all tasks of the fine stages share."""
+
+    scenes: tuple[Scene, ...]
+    pairs: tuple[Pair, ...]
+    grid: MapGrid
+    options: SurfaceOptions
+    work: Work
+
+    def match(self, tiles: Sequence[Tile], progress: Progress) -> None:
+        """Keep the disparities of every pair on every tile."""
+        tasks = [
+            (_pair_name(tile, number), partial(self._match_arguments, tile, pair))
+            for tile in tiles
+            if tile.heights_m is not None
+            for number, pair in enumerate(self.pairs)
+        ]
+        self.work.run(match_task, tasks, progress)
+
+    def align(self, tiles: Sequence[Tile], offset_m: Array, progress: Progress) -> tuple[Array, Array]:
+        """Shifts (p, 3) of the pairs, and the noise (p,) of their heights."""
+        count = len(self.pairs)
+        least = DISPARITY_SIGMA_PX / np.array([self._px_per_m(tiles, k) for k in range(count)])
+        sigma_m = least
+        shift = np.zeros((count, 3))
+        shift[:, 2] = -np.nan_to_num(offset_m)
+        for turn in range(_ROUNDS if count > 1 else 0):
+            names = [f"align/{turn}-{tile.name}" for tile in tiles]
+            tasks = [
+                (name, partial(self.fuse_arguments, tile, shift, sigma_m))
+                for name, tile in zip(names, tiles, strict=True)
+            ]
+            self.work.run(align_task, tasks, part_of(progress, turn / _ROUNDS, 1.0 / _ROUNDS))
+            sums = [self.work.kept[name] for name in names]
+            normal, right, distances = (
+                np.sum([one[part] for one in sums], axis=0) for part in ("normal", "right", "distances")
+            )
+            for number in np.flatnonzero(normal[:, 2, 2] >= _FEWEST_CELLS):
+                shift[number] += np.linalg.solve(normal[number], right[number])
+            sigma_m = np.maximum(least, noise_of_distances(distances))
+            shift -= np.average(shift, axis=0, weights=sigma_m**-2.0)
+        return shift, sigma_m
+
+    def fuse_arguments(self, tile: Tile, shift_m: Array, sigma_m: Array) -> tuple[Any, ...]:
+        """What `fuse_task` and `align_task` take."""
+        found = [self._surface(tile, number) for number in range(len(self.pairs))]
+        known = [(number, surface) for number, surface in enumerate(found) if surface is not None]
+        images = np.array(
+            [(self.pairs[n].first, self.pairs[n].second) for n, _ in known], dtype=np.int64
+        ).reshape(-1, 2)
+        numbers = np.array([number for number, _ in known], dtype=np.int64)
+        surfaces = [surface for _, surface in known]
+        part = part_of_grid(self.grid, tile.window, self._context)
+        pairs = PairsOfTile(numbers, images, shift_m[numbers], sigma_m[numbers], len(self.pairs))
+        return surfaces, part, pairs, self.options
+
+    @property
+    def _context(self) -> int:
+        """Cells around a tile that filling and roughness look at."""
+        return self.options.fill_cells + 2
+
+    def _match_arguments(self, tile: Tile, pair: Pair) -> tuple[Any, ...]:
+        part = part_of_grid(self.grid, tile.window, MARGIN_CELLS)
+        scenes = self.scenes[pair.first], self.scenes[pair.second]
+        return scenes, part, tile.heights_m, 1.0, self.options.matcher
+
+    def _surface(self, tile: Tile, number: int) -> PairSurface | None:
+        return None if tile.heights_m is None else pair_surface(self.work.kept[_pair_name(tile, number)])
+
+    def _px_per_m(self, tiles: Sequence[Tile], number: int) -> float:
+        surfaces = [self._surface(tile, number) for tile in tiles]
+        known = [abs(surface.px_per_m) for surface in surfaces if surface is not None]
+        return float(np.median(known)) if known else math.nan
+
+
+def _pair_name(tile: Tile, number: int) -> str:
+    return f"pairs/{tile.name}-{number:03d}"
+
+
+@dataclass(frozen=True)
+class PairsOfTile:
+    """The pairs that show a tile.
+
+    Attributes:
+        numbers: (k,) of them among all pairs.
+        images: (k, 2) numbers of their images.
+        shift_m, sigma_m: (k, 3), (k,); see `Surface`.
+        count: number of all pairs.
+    """
+
+    numbers: IntArray
+    images: IntArray
+    shift_m: Array
+    sigma_m: Array
+    count: int
+
+    def cells(self, surfaces: Sequence[PairSurface], tile: MapGrid) -> tuple[FloatImage, list[Reasons]]:
+        """Heights (k, lines, samples) of the pairs in the cells of the tile, and their reasons."""
+        cells = [
+            cells_of_pair(surface, tile, shift_m, _REACH_CELLS)
+            for surface, shift_m in zip(surfaces, self.shift_m, strict=True)
+        ]
+        return np.stack([heights for heights, _ in cells]), [why for _, why in cells]
+
+
+def align_task(
+    surfaces: Sequence[PairSurface], tile: MapGrid, pairs: PairsOfTile, options: SurfaceOptions
+) -> Arrays:
+    """What tells how the pairs lie off their fused surface on one tile; see `alignment_sums`."""
+    normal, right = np.zeros((pairs.count, 3, 3)), np.zeros((pairs.count, 3))
+    distances = np.zeros((pairs.count, DISTANCES), dtype=np.int64)
+    if len(surfaces) > 1:
+        heights, _ = pairs.cells(surfaces, tile)
+        fused = fuse(heights, pairs.sigma_m, pairs.images)
+        sums = alignment_sums(heights, fused.height_m, float(tile.step_xy[0, 1]))
+        normal[pairs.numbers], right[pairs.numbers], distances[pairs.numbers] = sums
+    return {"normal": normal, "right": right, "distances": distances}
+
+
+def fuse_task(
+    surfaces: Sequence[PairSurface], tile: MapGrid, pairs: PairsOfTile, options: SurfaceOptions
+) -> Arrays:
+    """The fused heights of a tile, without the cells around it that they need."""
+    context = options.fill_cells + 2
+    inside = np.s_[context:-context, context:-context]
+    if not surfaces:
+        lines, samples = (n - 2 * context for n in tile.shape)
+        unknown = np.full((lines, samples), np.nan, dtype=np.float32)
+        nothing = np.zeros((lines, samples), dtype=np.uint8)
+        reason = nothing + np.uint8(Reason.OUTSIDE)
+        return {"height_m": unknown, "sigma_m": unknown, "views": nothing, "reason": reason}
+    heights, reasons = pairs.cells(surfaces, tile)
+    reason = np.max(reasons, axis=0)
+    fused = fuse(heights, pairs.sigma_m, pairs.images)
+    height_m, sigma_m = filled_gaps(fused.height_m, fused.sigma_m, options.fill_cells)
+    reason[np.isfinite(height_m)] = Reason.FOUND
+    return {
+        "height_m": height_m[inside],
+        "sigma_m": sigma_m[inside],
+        "views": fused.views[inside],
+        "reason": reason[inside],
+    }
+
+
+def filled_gaps(height_m: FloatImage, sigma_m: FloatImage, reach: int) -> tuple[FloatImage, FloatImage]:
+    """Heights and sigmas with gaps filled by the means of the neighbours, ring after ring.
+
+    The sigma of a filled cell has half the range of its neighbours added.
+    """
+    for _ in range(reach):
+        known = np.isfinite(height_m)
+        count = cv2.boxFilter(known.astype(np.float32), -1, (3, 3), normalize=False)
+        gap = ~known & (count >= _NEIGHBOURS)
+        if not gap.any():
+            break
+        total = cv2.boxFilter(np.where(known, height_m, 0.0), -1, (3, 3), normalize=False)
+        sigma = cv2.boxFilter(np.where(known, sigma_m, 0.0), -1, (3, 3), normalize=False)
+        high = cv2.dilate(np.where(known, height_m, -np.inf).astype(np.float32), np.ones((3, 3)))
+        low = cv2.erode(np.where(known, height_m, np.inf).astype(np.float32), np.ones((3, 3)))
+        height_m, sigma_m = height_m.copy(), sigma_m.copy()
+        height_m[gap] = total[gap] / count[gap]
+        sigma_m[gap] = np.hypot(sigma[gap] / count[gap], (high[gap] - low[gap]) / 2.0)
+    return height_m, sigma_m

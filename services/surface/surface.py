@@ -1,0 +1,139 @@
+"""A surface from overlapping scenes: pairs of images chosen, matched tile by tile, aligned and fused."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from amers.services.errors import CoverageError
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import Window
+from amers.services.map_grid import MapGrid
+from amers.services.surface.coarse import AGREES_CELLS, CoarseSearch
+from amers.services.surface.match import Reasons
+from amers.services.surface.options import SurfaceOptions
+from amers.services.surface.pairs import Pair, candidate_pairs, choose_pairs
+from amers.services.surface.stages import Stages, fuse_task
+from amers.services.surface.tiles import Tile, grid_over, tiles_of
+from amers.services.tasks import Work
+from amers.services.types import Array, FloatImage, Progress, no_progress, part_of
+
+_DEFAULT = SurfaceOptions()
+_TRIED = 4
+"""Pairs that are tried with coarse pixels, for each one that is used."""
+
+
+@dataclass(frozen=True)
+class SurfaceTile:
+    """A part of a surface.
+
+    Attributes:
+        window: of the grid.
+        height_m, sigma_m: (lines, samples) above the ellipsoid, and one standard deviation; NaN for
+            none.
+        views: (lines, samples) uint8, number of images in which a height was found; 0 where it was
+            filled.
+        reason: (lines, samples) uint8, a `Reason`: why a cell has no height.
+    """
+
+    window: Window
+    height_m: FloatImage
+    sigma_m: FloatImage
+    views: Reasons
+    reason: Reasons
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A surface whose pairs are matched and aligned; `surface_tiles` fuses them.
+
+    Attributes:
+        stages: with the grid, the scenes, the pairs, and the work that keeps the disparities.
+        shift_m: (p, 3) by which each pair was moved onto the others: x, y and height.
+        sigma_m: (p,) noise of the heights of each pair, one standard deviation.
+        tiles: parts of the grid.
+    """
+
+    stages: Stages
+    shift_m: Array
+    sigma_m: Array
+    tiles: tuple[Tile, ...]
+
+    @property
+    def grid(self) -> MapGrid:
+        """Its cells."""
+        return self.stages.grid
+
+    @property
+    def pairs(self) -> tuple[Pair, ...]:
+        """That it is made of."""
+        return self.stages.pairs
+
+
+def make_surface(
+    scenes: Sequence[Scene],
+    options: SurfaceOptions = _DEFAULT,
+    *,
+    grid: MapGrid | None = None,
+    work: Work | None = None,
+    progress: Progress = no_progress,
+) -> Surface:
+    """Match the pairs of some scenes over a grid of the ground, and align them.
+
+    Args:
+        scenes: two or more, with models that agree: registered, or of one adjusted block.
+        options: of the surface.
+        grid: projected and north-up; by default in the UTM zone, over what two scenes show.
+        work: computes the tasks and keeps their results; by default in this process, in memory.
+        progress: receives the fraction done and a message.
+
+    Raises:
+        CoverageError: no two scenes see the same ground, or nothing of it was matched.
+    """
+    work = work or Work()
+    heights_m = options.heights_m or _common_heights(scenes)
+    candidates = candidate_pairs(scenes, heights_m, options.bases)
+    candidates = choose_pairs(candidates, _TRIED * options.pairs)
+    grid = grid or grid_over(scenes, candidates, options.gsd_m)
+    search = CoarseSearch(scenes, candidates, heights_m, options)
+    coarse = search.over(grid, work, part_of(progress, 0.0, 0.2))
+    agreement = coarse.agreement(AGREES_CELLS * float(grid.step_xy[0, 1]))
+    shown = [replace(p, merit=float(a)) for p, a in zip(candidates, agreement, strict=True)]
+    pairs = choose_pairs(shown, options.pairs)
+    coarse = coarse.of([shown.index(pair) for pair in pairs])
+    tiles = tuple(tiles_of(grid, scenes, pairs, coarse.around, options))
+    stages = Stages(tuple(scenes), tuple(pairs), grid, options, work)
+    stages.match(tiles, part_of(progress, 0.2, 0.6))
+    shift_m, sigma_m = stages.align(tiles, coarse.offset_m, part_of(progress, 0.8, 0.2))
+    return Surface(stages, shift_m, sigma_m, tiles)
+
+
+def surface_tiles(surface: Surface, progress: Progress = no_progress) -> Iterator[SurfaceTile]:
+    """The tiles of a surface, fused one after the other.
+
+    Args:
+        surface: matched and aligned.
+        progress: receives the fraction done.
+    """
+    stages = surface.stages
+    for number, tile in enumerate(surface.tiles):
+        progress(number / len(surface.tiles), f"fuse: {number} of {len(surface.tiles)}")
+        arguments = partial(stages.fuse_arguments, tile, surface.shift_m, surface.sigma_m)
+        stages.work.run(fuse_task, [(f"fuse/{tile.name}", arguments)])
+        found = stages.work.kept[f"fuse/{tile.name}"]
+        yield SurfaceTile(
+            tile.window, found["height_m"], found["sigma_m"], found["views"], found["reason"]
+        )
+
+
+def _common_heights(scenes: Sequence[Scene]) -> tuple[float, float]:
+    """Heights for which all models are meant."""
+    ranges = np.array([scene.model.height_range_m for scene in scenes])
+    low, high = float(ranges[:, 0].max()), float(ranges[:, 1].min())
+    if not low < high:
+        raise CoverageError(
+            f"the models of the scenes are meant for different heights, {ranges.round().tolist()} m: "
+            "state the heights of the ground"
+        )
+    return low, high
