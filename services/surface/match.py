@@ -67,19 +67,21 @@ class RectifiedPair:
 
 @dataclass(frozen=True)
 class Disparities:
-    """The result of a dense matching, by the pixels of the first image.
+    """The result of a dense matching.
 
     Attributes:
-        disparity: (rows, columns) float32; NaN where there is none.
-        reason: (rows, columns) uint8, a `Reason`.
+        first: (rows, columns) float32, by the pixels of the first image; NaN where there is none.
+        second: the same by those of the second one, that was found in the other direction.
+        reason: (rows, columns) uint8, a `Reason`, by the pixels of the first image.
     """
 
-    disparity: FloatImage
+    first: FloatImage
+    second: FloatImage
     reason: Reasons
 
 
 class DenseMatcher(Protocol):
-    """Finds the disparity of every pixel of the first image of a pair."""
+    """Finds the disparities of the pixels of both images of a pair."""
 
     def match(self, pair: RectifiedPair) -> Disparities:
         """The disparities of a pair, and why pixels have none."""
@@ -106,7 +108,7 @@ class SemiGlobal:
             there is no texture.
     """
 
-    small_penalty: int = 30
+    small_penalty: int = 18
     large_penalty: int = 150
     halving_step: float = 0.5
     max_difference_px: float = 0.75
@@ -126,15 +128,27 @@ class SemiGlobal:
         sums = disparity_sums(costs, _in_contrasts(pair.second, pair.second_valid), penalties)
         second = best_disparities(sums, pair.lowest)
         del costs, sums
-        reason = np.full(first.shape, Reason.FOUND, dtype=np.uint8)
-        reason[~(differences(first, second) <= self.max_difference_px)] = Reason.HIDDEN
-        reason[_flat(pair.first, pair.first_valid, self.least_contrast)] = Reason.NO_TEXTURE
-        reason[~pair.first_valid] = Reason.OUTSIDE
-        found = np.where(reason == Reason.FOUND, first, np.nan).astype(np.float32)
-        small = _small_patches(found, pair.lowest, self.smallest_patch_px)
-        reason[small] = Reason.ISOLATED
-        found[small] = np.nan
-        return Disparities(found, reason)
+        reason = self._reason(first, second, (pair.first, pair.first_valid), pair.lowest)
+        # Seen from the second image, disparities have the other sign.
+        back = self._reason(-second, -first, (pair.second, pair.second_valid), 1 - pair.lowest - pair.count)
+        return Disparities(
+            np.where(reason == Reason.FOUND, first, np.nan).astype(np.float32),
+            np.where(back == Reason.FOUND, second, np.nan).astype(np.float32),
+            reason,
+        )
+
+    def _reason(
+        self, own: FloatImage, other: FloatImage, seen: tuple[FloatImage, BoolArray], lowest: int
+    ) -> Reasons:
+        """Why pixels of an image have no disparity: by those of both directions, pixels, valid ones."""
+        pixels, valid = seen
+        reason = np.full(own.shape, Reason.FOUND, dtype=np.uint8)
+        reason[~(differences(own, other) <= self.max_difference_px)] = Reason.HIDDEN
+        reason[_flat(pixels, valid, self.least_contrast)] = Reason.NO_TEXTURE
+        reason[~valid] = Reason.OUTSIDE
+        found = np.where(reason == Reason.FOUND, own, np.nan).astype(np.float32)
+        reason[_small_patches(found, lowest, self.smallest_patch_px)] = Reason.ISOLATED
+        return reason
 
     def bytes_per_disparity(self) -> int:
         """Costs of one byte, and sums of two."""

@@ -24,22 +24,35 @@ class PairSurface:
     """The disparities of a pair over a tile, and the ground that they stand for.
 
     Attributes:
-        disparity: (rows, columns) float32; NaN where there is none.
-        reason: (rows, columns) uint8, a `Reason`.
+        first, second: (rows, columns) float32, by the pixels of either image; NaN where there is none.
+        reason: (rows, columns) uint8, a `Reason`, by the pixels of the first image.
         ground: (10, 3) map coordinates and height as polynomials; see `_terms`.
         centre, scale: (3,) of column, row and disparity in these polynomials.
         px_per_m: disparity for each metre of height, of either sign.
     """
 
-    disparity: FloatImage
+    first: FloatImage
+    second: FloatImage
     reason: Reasons
     ground: Array
     centre: Array
     scale: Array
     px_per_m: float
 
-    def positions(self, rows: IntArray, columns: IntArray, disparity: Array | FloatImage) -> Array:
-        """Map coordinates and heights (n, 3) of pixels with a disparity."""
+    def points(self) -> Array:
+        """Map coordinates and heights (n, 3) of everything that either direction found."""
+        rows, columns = np.nonzero(np.isfinite(self.first))
+        disparity = self.first[rows, columns]
+        other_rows, other_columns = np.nonzero(np.isfinite(self.second))
+        other = self.second[other_rows, other_columns]
+        return self.positions(
+            np.concatenate([rows, other_rows]),
+            np.concatenate([columns.astype(np.float64), other_columns + other]),
+            np.concatenate([disparity, other]),
+        )
+
+    def positions(self, rows: IntArray, columns: IntArray | Array, disparity: Array | FloatImage) -> Array:
+        """Map coordinates and heights (n, 3) of pixels of the first image with a disparity."""
         place = np.column_stack([columns, rows, disparity]).astype(np.float64)
         at = (place - self.centre) / self.scale
         return np.asarray(_terms(at) @ self.ground)
@@ -78,7 +91,8 @@ def match_pair(
     disparities = rectified.nodes[:, 2].reshape(3, -1).mean(axis=1)
     levels_m = rectified.xy_h[:, 2].reshape(3, -1).mean(axis=1)
     return PairSurface(
-        found.disparity,
+        found.first,
+        found.second,
         found.reason,
         ground,
         centre,
@@ -104,7 +118,8 @@ def pair_surface(arrays: Arrays) -> PairSurface | None:
     if not arrays:
         return None
     return PairSurface(
-        arrays["disparity"],
+        arrays["first"],
+        arrays["second"],
         arrays["reason"],
         arrays["ground"],
         arrays["centre"],
@@ -126,13 +141,12 @@ def cells_of_pair(
         shift_m: (3,) x, y and height, added to every point, in units of the map and metres.
         reach: largest distance of a point from the centre of the cell, cells.
     """
-    rows, columns = np.nonzero(np.isfinite(surface.disparity))
-    xyh = surface.positions(rows, columns, surface.disparity[rows, columns]) + shift_m
+    xyh = surface.points() + shift_m
     at = tile.line_sample_of_xy(xyh[:, :2])
     heights = _medians(at, xyh[:, 2].astype(np.float32), tile.shape, reach)
     reason = np.full(tile.shape, Reason.OUTSIDE, dtype=np.uint8)
     reason[np.isfinite(heights)] = Reason.FOUND
-    rows, columns = np.nonzero(~np.isfinite(surface.disparity))
+    rows, columns = np.nonzero(~np.isfinite(surface.first))
     ground = float(np.nanmedian(heights)) if np.isfinite(heights).any() else surface.ground[0, 2]
     middle = surface.centre[2] + (ground - surface.ground[0, 2]) * surface.px_per_m
     xyh = surface.positions(rows, columns, np.full(len(rows), middle)) + shift_m

@@ -160,7 +160,7 @@ def _add_paths(
 
 @njit(cache=True)
 def best_disparities(sums: Sums, lowest: int) -> FloatImage:
-    """Disparity (rows, columns) of the least sum, between steps by a parabola; NaN at the limits."""
+    """Disparity (rows, columns) of the least sum, NaN at the limits; between steps see `_fraction`."""
     rows, columns, count = sums.shape
     out = np.full((rows, columns), np.nan, dtype=np.float32)
     for i in range(rows):
@@ -172,10 +172,22 @@ def best_disparities(sums: Sums, lowest: int) -> FloatImage:
                     best, least = d, total[d]
             if 0 < best < count - 1:
                 left, right = float(total[best - 1]), float(total[best + 1])
-                curvature = left + right - 2.0 * float(least)
-                fraction = 0.5 * (left - right) / curvature if curvature > 0.0 else 0.0
-                out[i, j] = lowest + best + fraction
+                out[i, j] = lowest + best + _fraction(left - float(least), right - float(least))
     return out
+
+
+@njit(cache=True)
+def _fraction(left: float, right: float) -> float:
+    """Where the least cost lies between steps, by how much it rises to the left and to the right.
+
+    A parabola draws fractions towards whole steps, two lines of equal slope towards halves; their mean
+    spreads the disparities of real pairs evenly (benchmarks/surface.py).
+    """
+    if left + right <= 0.0:
+        return 0.0
+    parabola = 0.5 * (left - right) / (left + right)
+    lines = 0.5 * (left - right) / max(left, right)
+    return (parabola + lines) / 2.0
 
 
 @njit(cache=True)

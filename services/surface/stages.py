@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import cv2
 import numpy as np
 
 from amers.services.imagery.scene import Scene
 from amers.services.map_grid import MapGrid
+from amers.services.surface.fill import filled_gaps
 from amers.services.surface.fuse import (
     DISPARITY_SIGMA_PX,
     DISTANCES,
@@ -28,8 +28,6 @@ from amers.services.types import Array, FloatImage, IntArray, Progress, part_of
 
 _REACH_CELLS = 1.5
 """Distance of the points around a cell of which the median is its height."""
-_NEIGHBOURS = 3
-"""Cells with a height around one that is filled."""
 _ROUNDS = 3
 """Rounds of alignment: offsets first, then positions."""
 _FEWEST_CELLS = 1000
@@ -179,24 +177,3 @@ def fuse_task(
         "views": fused.views[inside],
         "reason": reason[inside],
     }
-
-
-def filled_gaps(height_m: FloatImage, sigma_m: FloatImage, reach: int) -> tuple[FloatImage, FloatImage]:
-    """Heights and sigmas with gaps filled by the means of the neighbours, ring after ring.
-
-    The sigma of a filled cell has half the range of its neighbours added.
-    """
-    for _ in range(reach):
-        known = np.isfinite(height_m)
-        count = cv2.boxFilter(known.astype(np.float32), -1, (3, 3), normalize=False)
-        gap = ~known & (count >= _NEIGHBOURS)
-        if not gap.any():
-            break
-        total = cv2.boxFilter(np.where(known, height_m, 0.0), -1, (3, 3), normalize=False)
-        sigma = cv2.boxFilter(np.where(known, sigma_m, 0.0), -1, (3, 3), normalize=False)
-        high = cv2.dilate(np.where(known, height_m, -np.inf).astype(np.float32), np.ones((3, 3)))
-        low = cv2.erode(np.where(known, height_m, np.inf).astype(np.float32), np.ones((3, 3)))
-        height_m, sigma_m = height_m.copy(), sigma_m.copy()
-        height_m[gap] = total[gap] / count[gap]
-        sigma_m[gap] = np.hypot(sigma[gap] / count[gap], (high[gap] - low[gap]) / 2.0)
-    return height_m, sigma_m
