@@ -35,7 +35,7 @@ class MadeOptions:
     gsd_m: Annotated[float | None, typer.Option(min=0.01)] = None
     heights_m: str | None = None
     pairs: Annotated[int, typer.Option(min=1)] = 6
-    fill_cells: Annotated[int, typer.Option(min=0, max=20)] = 10
+    fill_cells: Annotated[int, typer.Option(min=0, max=20)] = 20
 
     def options(self) -> SurfaceOptions:
         """The same as the service takes it.

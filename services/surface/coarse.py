@@ -1,6 +1,5 @@
 """A search with coarse pixels: which pairs agree, and between which heights the surface lies."""
 
-import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ from amers.services.map_grid import MapGrid
 from amers.services.surface.options import SurfaceOptions
 from amers.services.surface.pair_surface import cells_of_pair, match_task, pair_surface
 from amers.services.surface.pairs import Pair
-from amers.services.surface.tiles import LARGEST_TILE, MARGIN_CELLS, part_of_grid, windows_of
+from amers.services.surface.tiles import LARGEST_TILE, MARGIN_CELLS, coarser, part_of_grid, windows_of
 from amers.services.tasks import Work
 from amers.services.types import Array, FloatImage, Progress
 
@@ -104,9 +103,7 @@ class CoarseSearch:
         Raises:
             CoverageError: nothing of it was matched.
         """
-        lines, samples = (math.ceil(n / COARSE) for n in grid.shape)
-        origin = grid.xy(np.full((1, 2), (COARSE - 1) / 2.0))[0]
-        coarse = MapGrid(grid.crs, origin, grid.step_xy * COARSE, (lines, samples))
+        coarse = coarser(grid, COARSE)
         windows = windows_of(coarse.shape, LARGEST_TILE // 2)
         numbers = range(len(self.pairs))
         tasks = [

@@ -28,7 +28,10 @@ _AROUND_CELLS = 9
 """Side of the square around a cell whose roughness counts, cells."""
 _SAME_M = 1.0
 """Heights of pairs that differ by less are of one surface."""
-Views = npt.NDArray[np.uint8]
+_ENOUGH, _ENOUGH_SHARE = 2, 1.0 / 3.0
+"""Pairs that have to agree on a surface, and their share of those that see the place: lidar shows heights
+that one pair of several has to be wrong more often than those around them (benchmarks/surface.py)."""
+Counts = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -39,11 +42,13 @@ class Fused:
         height_m: (lines, samples) above the ellipsoid; NaN where no pair has one.
         sigma_m: (lines, samples) one standard deviation of it.
         views: (lines, samples) uint8, number of images that it was found in.
+        agree: (lines, samples) uint8, number of pairs that agree on it.
     """
 
     height_m: FloatImage
     sigma_m: FloatImage
-    views: Views
+    views: Counts
+    agree: Counts
 
 
 def fuse(heights: FloatImage, sigma_m: Array, pairs: IntArray) -> Fused:
@@ -54,9 +59,9 @@ def fuse(heights: FloatImage, sigma_m: Array, pairs: IntArray) -> Fused:
         sigma_m: (p,) noise of the heights of each pair, one standard deviation.
         pairs: (p, 2) numbers of their images.
     """
-    height_m, variance, views = _fused(heights, sigma_m, pairs)
+    height_m, variance, views, agree = _fused(heights, sigma_m, pairs)
     sigma = np.sqrt(variance + roughness_m(height_m) ** 2)
-    return Fused(height_m, sigma.astype(np.float32), views)
+    return Fused(height_m, sigma.astype(np.float32), views, agree)
 
 
 def roughness_m(height_m: FloatImage) -> FloatImage:
@@ -133,11 +138,14 @@ def alignment_sums(
 
 
 @njit(cache=True)
-def _fused(heights: FloatImage, sigma_m: Array, pairs: IntArray) -> tuple[FloatImage, FloatImage, Views]:
+def _fused(
+    heights: FloatImage, sigma_m: Array, pairs: IntArray
+) -> tuple[FloatImage, FloatImage, Counts, Counts]:
     count, lines, samples = heights.shape
     out = np.full((lines, samples), np.nan, dtype=np.float32)
     variance = np.full((lines, samples), np.nan, dtype=np.float32)
     views = np.zeros((lines, samples), dtype=np.uint8)
+    agree = np.zeros((lines, samples), dtype=np.uint8)
     weight = 1.0 / sigma_m**2
     for i in range(lines):
         for j in range(samples):
@@ -145,8 +153,7 @@ def _fused(heights: FloatImage, sigma_m: Array, pairs: IntArray) -> tuple[FloatI
             known = np.isfinite(values)
             if not known.any():
                 continue
-            middle = _weighted_median(values, weight, known)
-            used = known & (np.abs(values - middle) <= np.maximum(_SAME_M, 3.0 * sigma_m))
+            used = _agreeing(values, sigma_m, known)
             own = np.where(used, weight, 0.0)
             mean = 0.0
             for p in range(count):
@@ -156,23 +163,36 @@ def _fused(heights: FloatImage, sigma_m: Array, pairs: IntArray) -> tuple[FloatI
             for p in range(count):
                 scatter += own[p] * (values[p] - mean) ** 2 if used[p] else 0.0
             scatter /= own.sum() * max(used.sum() - 1, 1)
-            # Pairs that do not agree with the middle show another surface: they widen the sigma.
+            # Pairs that do not agree show another surface: they widen the sigma.
             apart = 1.0 - own.sum() / weight[known].sum()
             out[i, j] = mean
             variance[i, j] = _noise(sigma_m, pairs, used) + scatter + apart * _SAME_M**2
             views[i, j] = _number_of_images(pairs, used)
-    return out, variance, views
+            agree[i, j] = used.sum()
+    return out, variance, views, agree
 
 
 @njit(cache=True)
-def _weighted_median(values: FloatImage, weight: Array, known: BoolArray) -> float:
-    half = weight[known].sum() / 2.0
-    below = 0.0
+def _agreeing(values: FloatImage, sigma_m: Array, known: BoolArray) -> BoolArray:
+    """The pairs of the lowest surface that enough pairs agree on; one pair, the best, where none do.
+
+    Of two surfaces that pairs see, the lower one is the ground: matches of edges of roofs and trees reach
+    over the ground beside them, hidden ground never reaches over a roof.
+    """
+    enough = max(_ENOUGH, int(np.ceil(known.sum() * _ENOUGH_SHARE)))
+    best = -1
     for p in np.argsort(values):  # unknown ones, which are NaN, come last
-        below += weight[p]
-        if below >= half:
-            return float(values[p])
-    return np.nan
+        if not known[p]:
+            break
+        apart = values - values[p]
+        used = known & (np.abs(apart) <= np.maximum(_SAME_M, 3.0 * np.maximum(sigma_m, sigma_m[p])))
+        if used.sum() >= enough:
+            return used
+        if best < 0 or sigma_m[p] < sigma_m[best]:
+            best = p
+    alone = np.zeros(len(values), dtype=np.bool_)
+    alone[best] = True
+    return alone
 
 
 @njit(cache=True)

@@ -23,5 +23,5 @@ class SurfaceOptions:
     heights_m: tuple[float, float] | None = None
     pairs: int = 6
     bases: tuple[float, float] = (0.12, 0.9)
-    fill_cells: int = 10
+    fill_cells: int = 20
     matcher: SemiGlobal = field(default_factory=SemiGlobal)

@@ -39,23 +39,18 @@ class PairSurface:
     scale: Array
     px_per_m: float
 
-    def points(self) -> Array:
-        """Map coordinates and heights (n, 3) of everything that either direction found."""
-        rows, columns = np.nonzero(np.isfinite(self.first))
-        disparity = self.first[rows, columns]
-        other_rows, other_columns = np.nonzero(np.isfinite(self.second))
-        other = self.second[other_rows, other_columns]
-        return self.positions(
-            np.concatenate([rows, other_rows]),
-            np.concatenate([columns.astype(np.float64), other_columns + other]),
-            np.concatenate([disparity, other]),
-        )
+    def on_cells(self, tile: MapGrid, shift_m: Array) -> Array:
+        """The polynomials (10, 3) with lines and samples of a tile instead of map coordinates.
 
-    def positions(self, rows: IntArray, columns: IntArray | Array, disparity: Array | FloatImage) -> Array:
-        """Map coordinates and heights (n, 3) of pixels of the first image with a disparity."""
-        place = np.column_stack([columns, rows, disparity]).astype(np.float64)
-        at = (place - self.centre) / self.scale
-        return np.asarray(_terms(at) @ self.ground)
+        Args:
+            tile: the cells.
+            shift_m: (3,) x, y and height, added to every point.
+        """
+        moved = self.ground.copy()
+        moved[0] += shift_m
+        moved[0, :2] -= tile.origin_xy
+        moved[:, :2] = moved[:, :2] @ np.linalg.inv(tile.step_xy).T
+        return moved
 
 
 def match_pair(
@@ -141,16 +136,16 @@ def cells_of_pair(
         shift_m: (3,) x, y and height, added to every point, in units of the map and metres.
         reach: largest distance of a point from the centre of the cell, cells.
     """
-    xyh = surface.points() + shift_m
-    at = tile.line_sample_of_xy(xyh[:, :2])
-    heights = _medians(at, xyh[:, 2].astype(np.float32), tile.shape, reach)
+    place = (surface.on_cells(tile, shift_m), surface.centre, surface.scale)
+    points = np.concatenate([_placed(surface.first, False, *place), _placed(surface.second, True, *place)])
+    heights = _medians(points, tile.shape, reach)
     reason = np.full(tile.shape, Reason.OUTSIDE, dtype=np.uint8)
     reason[np.isfinite(heights)] = Reason.FOUND
-    rows, columns = np.nonzero(~np.isfinite(surface.first))
-    ground = float(np.nanmedian(heights)) if np.isfinite(heights).any() else surface.ground[0, 2]
+    ground = float(np.nanmedian(points[:, 2])) if len(points) else surface.ground[0, 2]
     middle = surface.centre[2] + (ground - surface.ground[0, 2]) * surface.px_per_m
-    xyh = surface.positions(rows, columns, np.full(len(rows), middle)) + shift_m
-    _mark(reason, tile.line_sample_of_xy(xyh[:, :2]), surface.reason[rows, columns])
+    missing = ~np.isfinite(surface.first)
+    supposed = np.where(missing, np.float32(middle), np.float32(np.nan))
+    _mark(reason, _placed(supposed, False, *place), surface.reason[missing])
     return heights, reason
 
 
@@ -176,50 +171,82 @@ def _terms(at: Array) -> Array:
 
 
 @njit(cache=True)
-def _medians(at: Array, heights: FloatImage, shape: tuple[int, int], reach: float) -> FloatImage:
-    """Median (lines, samples) of the heights (n,) at positions (n, 2) near every cell; NaN for none."""
-    lines, samples = shape
-    start = np.zeros(lines * samples + 1, dtype=np.int64)
-    nothing = np.empty(0, dtype=np.float32)
-    for p in range(len(heights)):
-        _near_cells(at[p], np.float32(0.0), shape, reach, start[1:], nothing)
-    start = np.cumsum(start)
-    values = np.empty(start[-1], dtype=np.float32)
-    place = start[:-1].copy()
-    for p in range(len(heights)):
-        _near_cells(at[p], heights[p], shape, reach, place, values)
-    out = np.full((lines, samples), np.nan, dtype=np.float32)
-    for cell in range(lines * samples):
-        if start[cell + 1] > start[cell]:
-            out[cell // samples, cell % samples] = np.median(values[start[cell] : start[cell + 1]])
+def _placed(
+    disparity: FloatImage, of_second: bool, ground: Array, centre: Array, scale: Array
+) -> FloatImage:
+    """Line, sample and height (n, 3) of all pixels with a disparity, row after row.
+
+    Args:
+        disparity: (rows, columns); NaN where there is none.
+        of_second: pixels are those of the second image.
+        ground: (10, 3) polynomials; see `PairSurface.on_cells`.
+        centre, scale: of them.
+    """
+    rows, columns = disparity.shape
+    out = np.empty((np.isfinite(disparity).sum(), 3), dtype=np.float32)
+    count = 0
+    for i in range(rows):
+        r = (i - centre[1]) / scale[1]
+        for j in range(columns):
+            value = disparity[i, j]
+            if not np.isfinite(value):
+                continue
+            c = (j + (value if of_second else 0.0) - centre[0]) / scale[0]
+            d = (value - centre[2]) / scale[2]
+            for k in range(3):
+                g = ground[:, k]
+                linear = g[0] + c * (g[1] + r * g[4] + c * g[7]) + r * (g[2] + r * g[8])
+                out[count, k] = linear + d * (g[3] + c * g[5] + r * g[6] + d * g[9])
+            count += 1
     return out
 
 
 @njit(cache=True)
-def _near_cells(  # noqa: PLR0917 - arrays of the innermost loop
-    at: Array,
-    height: np.float32,
-    shape: tuple[int, int],
-    reach: float,
-    place: IntArray,
-    values: FloatImage,
+def _medians(points: FloatImage, shape: tuple[int, int], reach: float) -> FloatImage:
+    """Median (lines, samples) of the heights of points (n, 3) near every cell; NaN for none."""
+    lines, samples = shape
+    start = np.zeros(lines * samples + 1, dtype=np.int64)
+    nothing = np.empty(0, dtype=np.float32)
+    for p in range(len(points)):
+        _near_cells(points[p], shape, reach, start[1:], nothing)
+    start = np.cumsum(start)
+    values = np.empty(start[-1], dtype=np.float32)
+    place = start[:-1].copy()
+    for p in range(len(points)):
+        _near_cells(points[p], shape, reach, place, values)
+    out = np.full((lines, samples), np.nan, dtype=np.float32)
+    for cell in range(lines * samples):
+        first, count = start[cell], start[cell + 1] - start[cell]
+        if count:
+            own = values[first : first + count]
+            for k in range(1, count):  # few values: sorted faster so than by any other means
+                value, m = own[k], k
+                while m > 0 and own[m - 1] > value:
+                    own[m] = own[m - 1]
+                    m -= 1
+                own[m] = value
+            out[cell // samples, cell % samples] = (own[(count - 1) // 2] + own[count // 2]) / 2.0
+    return out
+
+
+@njit(cache=True)
+def _near_cells(
+    point: FloatImage, shape: tuple[int, int], reach: float, place: IntArray, values: FloatImage
 ) -> None:
     """Count a point for the cells around it in `place`; with values, write its height there."""
-    whole = int(np.ceil(reach))
-    if not (-whole <= at[0] < shape[0] + whole and -whole <= at[1] < shape[1] + whole):
-        return
-    line, sample = int(np.round(at[0])), int(np.round(at[1]))
-    for i in range(max(line - whole, 0), min(line + whole + 1, shape[0])):
-        for j in range(max(sample - whole, 0), min(sample + whole + 1, shape[1])):
-            if (i - at[0]) ** 2 + (j - at[1]) ** 2 <= reach * reach:
+    first = max(int(np.ceil(point[0] - reach)), 0), max(int(np.ceil(point[1] - reach)), 0)
+    last = int(np.floor(point[0] + reach)), int(np.floor(point[1] + reach))
+    for i in range(first[0], min(last[0] + 1, shape[0])):
+        for j in range(first[1], min(last[1] + 1, shape[1])):
+            if (i - point[0]) ** 2 + (j - point[1]) ** 2 <= reach * reach:
                 cell = i * shape[1] + j
                 if len(values):
-                    values[place[cell]] = height
+                    values[place[cell]] = point[2]
                 place[cell] += 1
 
 
 @njit(cache=True)
-def _mark(reason: Reasons, at: Array, reasons: Reasons) -> None:
+def _mark(reason: Reasons, at: FloatImage, reasons: Reasons) -> None:
     """Give cells without a height the strongest reason of the pixels in and next to them."""
     lines, samples = reason.shape
     for p in range(len(reasons)):

@@ -22,12 +22,14 @@ from amers.services.surface.match import Reason, Reasons
 from amers.services.surface.options import SurfaceOptions
 from amers.services.surface.pair_surface import PairSurface, cells_of_pair, match_task, pair_surface
 from amers.services.surface.pairs import Pair
-from amers.services.surface.tiles import MARGIN_CELLS, Tile, part_of_grid
+from amers.services.surface.tiles import MARGIN_CELLS, Tile, coarser, part_of_grid
 from amers.services.tasks import Arrays, Work
 from amers.services.types import Array, FloatImage, IntArray, Progress, part_of
 
-_REACH_CELLS = 1.5
+_REACH_CELLS = 1.0
 """Distance of the points around a cell of which the median is its height."""
+_ALIGNED_CELLS = 2
+"""Cells of the surface along each side of one that pairs are aligned by."""
 _ROUNDS = 3
 """Rounds of alignment: offsets first, then positions."""
 _FEWEST_CELLS = 1000
@@ -131,10 +133,12 @@ class PairsOfTile:
     sigma_m: Array
     count: int
 
-    def cells(self, surfaces: Sequence[PairSurface], tile: MapGrid) -> tuple[FloatImage, list[Reasons]]:
+    def cells(
+        self, surfaces: Sequence[PairSurface], tile: MapGrid, reach: float
+    ) -> tuple[FloatImage, list[Reasons]]:
         """Heights (k, lines, samples) of the pairs in the cells of the tile, and their reasons."""
         cells = [
-            cells_of_pair(surface, tile, shift_m, _REACH_CELLS)
+            cells_of_pair(surface, tile, shift_m, reach)
             for surface, shift_m in zip(surfaces, self.shift_m, strict=True)
         ]
         return np.stack([heights for heights, _ in cells]), [why for _, why in cells]
@@ -147,7 +151,8 @@ def align_task(
     normal, right = np.zeros((pairs.count, 3, 3)), np.zeros((pairs.count, 3))
     distances = np.zeros((pairs.count, DISTANCES), dtype=np.int64)
     if len(surfaces) > 1:
-        heights, _ = pairs.cells(surfaces, tile)
+        tile = coarser(tile, _ALIGNED_CELLS)
+        heights, _ = pairs.cells(surfaces, tile, _REACH_CELLS / _ALIGNED_CELLS)
         fused = fuse(heights, pairs.sigma_m, pairs.images)
         sums = alignment_sums(heights, fused.height_m, float(tile.step_xy[0, 1]))
         normal[pairs.numbers], right[pairs.numbers], distances[pairs.numbers] = sums
@@ -166,10 +171,19 @@ def fuse_task(
         nothing = np.zeros((lines, samples), dtype=np.uint8)
         reason = nothing + np.uint8(Reason.OUTSIDE)
         return {"height_m": unknown, "sigma_m": unknown, "views": nothing, "reason": reason}
-    heights, reasons = pairs.cells(surfaces, tile)
+    heights, reasons = pairs.cells(surfaces, tile, _REACH_CELLS)
     reason = np.max(reasons, axis=0)
     fused = fuse(heights, pairs.sigma_m, pairs.images)
-    height_m, sigma_m = filled_gaps(fused.height_m, fused.sigma_m, options.fill_cells)
+    height_m, sigma_m = fused.height_m, fused.sigma_m
+    if (fused.agree > 1).any():
+        # What one pair of several sees is no more certain than what is around it.
+        unsure = fused.agree < 2
+        sure = np.where(unsure, np.float32(np.nan), height_m)
+        around, around_sigma_m = filled_gaps(sure, sigma_m, options.fill_cells)
+        replaced = unsure & np.isfinite(around)
+        height_m, sigma_m = np.where(replaced, around, height_m), np.where(replaced, around_sigma_m, sigma_m)
+        fused.views[replaced] = 0
+    height_m, sigma_m = filled_gaps(height_m, sigma_m, options.fill_cells)
     reason[np.isfinite(height_m)] = Reason.FOUND
     return {
         "height_m": height_m[inside],

@@ -69,6 +69,13 @@ def part_of_grid(grid: MapGrid, window: Window, margin: int) -> MapGrid:
     return MapGrid(grid.crs, grid.xy(first[None, :])[0], grid.step_xy, shape)
 
 
+def coarser(grid: MapGrid, times: int) -> MapGrid:
+    """The grid over the same ground whose cells are some times as long and as wide."""
+    origin = grid.xy(np.full((1, 2), (times - 1) / 2.0))[0]
+    shape = tuple(math.ceil(n / times) for n in grid.shape)
+    return MapGrid(grid.crs, origin, grid.step_xy * times, (shape[0], shape[1]))
+
+
 def windows_of(shape: tuple[int, int], side: int) -> list[Window]:
     """Windows of a grid of about equal sizes, at most `side` cells wide and high."""
     parts = [np.linspace(0, n, math.ceil(n / side) + 1).round().astype(int).tolist() for n in shape]
