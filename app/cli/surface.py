@@ -34,7 +34,7 @@ class MadeOptions:
 
     gsd_m: Annotated[float | None, typer.Option(min=0.01)] = None
     heights_m: str | None = None
-    pairs: Annotated[int, typer.Option(min=1)] = 6
+    pairs: Annotated[int, typer.Option(min=1)] = 10
     fill_cells: Annotated[int, typer.Option(min=0, max=20)] = 20
 
     def options(self) -> SurfaceOptions:

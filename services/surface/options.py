@@ -21,7 +21,7 @@ class SurfaceOptions:
 
     gsd_m: float | None = None
     heights_m: tuple[float, float] | None = None
-    pairs: int = 6
-    bases: tuple[float, float] = (0.12, 0.9)
+    pairs: int = 10
+    bases: tuple[float, float] = (0.1, 0.9)
     fill_cells: int = 20
     matcher: SemiGlobal = field(default_factory=SemiGlobal)

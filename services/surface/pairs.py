@@ -23,6 +23,9 @@ _HALVED_DAYS = 60.0
 """Days between two images after which a pair is half as good: seasons, leaves, cars (the same dates)."""
 _USED_AGAIN = 0.8
 """What an image that another pair uses leaves of the merit of a pair: their noise is not independent."""
+LEAST_SHOWN = 0.75
+"""Share of the merit of the best pair that others need, once coarse pixels have shown it: worse ones added
+noise to surfaces of four to ten pairs against lidar (benchmarks/surface.py)."""
 _LEAST_OVERLAP = 0.02
 """Share of the smaller image that both have to show."""
 
@@ -85,16 +88,18 @@ def candidate_pairs(
     return candidates
 
 
-def choose_pairs(candidates: Sequence[Pair], most: int) -> list[Pair]:
+def choose_pairs(candidates: Sequence[Pair], most: int, least: float = 0.0) -> list[Pair]:
     """The best of some pairs, of which those of images that were not used yet come first.
 
     Args:
         candidates: to choose from.
         most: pairs at most.
+        least: share of the merit of the best pair that others need.
     """
     chosen: list[Pair] = []
     used = Counter[int]()
-    rest = list(candidates)
+    best_merit = max(pair.merit for pair in candidates)
+    rest = [pair for pair in candidates if pair.merit >= least * best_merit]
     while rest and len(chosen) < most:
         best = max(rest, key=lambda p: p.merit * _USED_AGAIN ** (used[p.first] + used[p.second]))
         rest.remove(best)

@@ -17,6 +17,7 @@ from amers.services.surface.fuse import (
     alignment_sums,
     fuse,
     noise_of_distances,
+    roughness_m,
 )
 from amers.services.surface.match import Reason, Reasons
 from amers.services.surface.options import SurfaceOptions
@@ -184,6 +185,7 @@ def fuse_task(
         height_m, sigma_m = np.where(replaced, around, height_m), np.where(replaced, around_sigma_m, sigma_m)
         fused.views[replaced] = 0
     height_m, sigma_m = filled_gaps(height_m, sigma_m, options.fill_cells)
+    sigma_m = np.hypot(sigma_m, roughness_m(height_m))
     reason[np.isfinite(height_m)] = Reason.FOUND
     return {
         "height_m": height_m[inside],

@@ -13,14 +13,14 @@ from amers.services.map_grid import MapGrid
 from amers.services.surface.coarse import AGREES_CELLS, CoarseSearch
 from amers.services.surface.match import Reasons
 from amers.services.surface.options import SurfaceOptions
-from amers.services.surface.pairs import Pair, candidate_pairs, choose_pairs
+from amers.services.surface.pairs import LEAST_SHOWN, Pair, candidate_pairs, choose_pairs
 from amers.services.surface.stages import Stages, fuse_task
 from amers.services.surface.tiles import Tile, grid_over, tiles_of
 from amers.services.tasks import Work
 from amers.services.types import Array, FloatImage, Progress, no_progress, part_of
 
 _DEFAULT = SurfaceOptions()
-_TRIED = 4
+_TRIED = 3
 """Pairs that are tried with coarse pixels, for each one that is used."""
 
 
@@ -100,7 +100,7 @@ def make_surface(
     coarse = search.over(grid, work, part_of(progress, 0.0, 0.2))
     agreement = coarse.agreement(AGREES_CELLS * float(grid.step_xy[0, 1]))
     shown = [replace(p, merit=float(a)) for p, a in zip(candidates, agreement, strict=True)]
-    pairs = choose_pairs(shown, options.pairs)
+    pairs = choose_pairs(shown, options.pairs, LEAST_SHOWN)
     coarse = coarse.of([shown.index(pair) for pair in pairs])
     tiles = tuple(tiles_of(grid, scenes, pairs, coarse.around, options))
     stages = Stages(tuple(scenes), tuple(pairs), grid, options, work)
