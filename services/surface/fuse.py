@@ -27,13 +27,13 @@ DISTANCE_M, DISTANCES = 0.02, 100
 _AROUND_CELLS = 9
 """Side of the square around a cell whose roughness counts, cells."""
 _ROUGHNESS_COUNTS = 1.5
-"""How much of the roughness is error: the 90 % intervals of pairs and of fused surfaces hold 0.82 to 0.89
-of all heights in a town with it, 0.77 to 0.85 with 1 (benchmarks/surface.py)."""
+"""How much of the roughness is error: the 90 % intervals of pairs and of fused surfaces hold 0.82 to
+0.89 of all heights in a town with it, 0.77 to 0.85 with 1 (benchmarks/surface.py)."""
 _SAME_M = 1.0
 """Heights of pairs that differ by less are of one surface."""
 _ENOUGH, _ENOUGH_SHARE = 2, 1.0 / 3.0
-"""Pairs that have to agree on a surface, and their share of those that see the place: lidar shows heights
-that one pair of several has to be wrong more often than those around them (benchmarks/surface.py)."""
+"""Pairs that have to agree on a surface, and their share of those that see the place: heights that one
+pair of several has are wrong more often than those around them (lidar, benchmarks/surface.py)."""
 Counts = npt.NDArray[np.uint8]
 
 
@@ -178,8 +178,8 @@ def _fused(
 def _agreeing(values: FloatImage, sigma_m: Array, known: BoolArray) -> BoolArray:
     """The pairs of the lowest surface that enough pairs agree on; one pair, the best, where none do.
 
-    Of two surfaces that pairs see, the lower one is the ground: matches of edges of roofs and trees reach
-    over the ground beside them, hidden ground never reaches over a roof.
+    Of two surfaces that pairs see, the lower one is the ground: matches of edges of roofs and trees
+    reach over the ground beside them, hidden ground never reaches over a roof.
     """
     enough = max(_ENOUGH, int(np.ceil(known.sum() * _ENOUGH_SHARE)))
     best = -1

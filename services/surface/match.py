@@ -130,7 +130,9 @@ class SemiGlobal:
         del costs, sums
         reason = self._reason(first, second, (pair.first, pair.first_valid), pair.lowest)
         # Seen from the second image, disparities have the other sign.
-        back = self._reason(-second, -first, (pair.second, pair.second_valid), 1 - pair.lowest - pair.count)
+        back = self._reason(
+            -second, -first, (pair.second, pair.second_valid), 1 - pair.lowest - pair.count
+        )
         return Disparities(
             np.where(reason == Reason.FOUND, first, np.nan).astype(np.float32),
             np.where(back == Reason.FOUND, second, np.nan).astype(np.float32),

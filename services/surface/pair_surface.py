@@ -2,17 +2,19 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numba import njit
 
 from amers.services.errors import ComputationError
 from amers.services.imagery.scene import Scene
 from amers.services.map_grid import MapGrid
-from amers.services.surface.match import DenseMatcher, Reason, Reasons, RectifiedPair
-from amers.services.surface.rectify import Rectification, rectify, resampled
+from amers.services.surface.match import DenseMatcher, Disparities, Reason, Reasons, RectifiedPair
+from amers.services.surface.rectify import LEVELS, Rectification, rectify, resampled
 from amers.services.tasks import Arrays
-from amers.services.types import Array, FloatImage, IntArray
+from amers.services.types import Array, BoolArray, FloatImage, IntArray
 
+_UNMARKED = np.uint8(255)
 _TERMS = 10
 """Terms of the polynomials of the second degree in column, row and disparity."""
 _MAX_FIT_M = 0.05
@@ -82,9 +84,10 @@ def match_pair(
         return None
     pair = RectifiedPair(one, two, one_valid, two_valid, *rectified.disparities)
     found = matcher.match(pair)
+    found.reason[_beside_second(found, two_valid)] = Reason.OUTSIDE
     ground, centre, scale = _polynomials(rectified)
-    disparities = rectified.nodes[:, 2].reshape(3, -1).mean(axis=1)
-    levels_m = rectified.xy_h[:, 2].reshape(3, -1).mean(axis=1)
+    disparities = rectified.nodes[:, 2].reshape(LEVELS, -1).mean(axis=1)
+    levels_m = rectified.xy_h[:, 2].reshape(LEVELS, -1).mean(axis=1)
     return PairSurface(
         found.first,
         found.second,
@@ -137,16 +140,47 @@ def cells_of_pair(
         reach: largest distance of a point from the centre of the cell, cells.
     """
     place = (surface.on_cells(tile, shift_m), surface.centre, surface.scale)
-    points = np.concatenate([_placed(surface.first, False, *place), _placed(surface.second, True, *place)])
+    points = np.concatenate(
+        [_placed(surface.first, False, *place), _placed(surface.second, True, *place)]
+    )
     heights = _medians(points, tile.shape, reach)
-    reason = np.full(tile.shape, Reason.OUTSIDE, dtype=np.uint8)
-    reason[np.isfinite(heights)] = Reason.FOUND
+    reason = np.where(np.isfinite(heights), np.uint8(Reason.FOUND), _UNMARKED)
     ground = float(np.nanmedian(points[:, 2])) if len(points) else surface.ground[0, 2]
     middle = surface.centre[2] + (ground - surface.ground[0, 2]) * surface.px_per_m
     missing = ~np.isfinite(surface.first)
     supposed = np.where(missing, np.float32(middle), np.float32(np.nan))
     _mark(reason, _placed(supposed, False, *place), surface.reason[missing])
+    # No pixel of the first image shows this ground: it did not look there, or something stood before it.
+    looked = _looked_at(surface, *place, middle, tile.shape)
+    reason[reason == _UNMARKED] = np.where(looked, Reason.HIDDEN, Reason.OUTSIDE)[reason == _UNMARKED]
     return heights, reason
+
+
+def _looked_at(  # noqa: PLR0917 - a place is three arrays
+    surface: PairSurface,
+    ground: Array,
+    centre: Array,
+    scale: Array,
+    middle: float,
+    shape: tuple[int, int],
+) -> BoolArray:
+    """The cells (lines, samples) of the quadrangle that the rectified image covers."""
+    rows, columns = surface.first.shape
+    corners = np.array([[0, 0], [columns, 0], [columns, rows], [0, rows]], dtype=np.float64)
+    place = np.column_stack([corners, np.full(len(corners), middle)])
+    outline = (_terms((place - centre) / scale) @ ground)[:, [1, 0]]
+    covered = np.zeros(shape, dtype=np.uint8)
+    cv2.fillConvexPoly(covered, outline.round().astype(np.int32), 1)
+    return np.asarray(covered, dtype=np.bool_)
+
+
+def _beside_second(found: Disparities, second_valid: BoolArray) -> BoolArray:
+    """Pixels without a match that, were they as high as most, would lie beside the second image."""
+    known = found.first[np.isfinite(found.first)]
+    places = np.arange(found.first.shape[1]) - (round(float(np.median(known))) if len(known) else 0)
+    inside = (places >= 0) & (places < second_valid.shape[1])
+    seen = second_valid[:, np.clip(places, 0, second_valid.shape[1] - 1)] & inside
+    return np.asarray((found.reason == Reason.HIDDEN) & ~seen)
 
 
 def _polynomials(rectified: Rectification) -> tuple[Array, Array, Array]:
@@ -255,5 +289,5 @@ def _mark(reason: Reasons, at: FloatImage, reasons: Reasons) -> None:
         line, sample = int(np.round(at[p, 0])), int(np.round(at[p, 1]))
         for i in range(max(line - 1, 0), min(line + 2, lines)):
             for j in range(max(sample - 1, 0), min(sample + 2, samples)):
-                if reason[i, j] != 0 and reasons[p] > reason[i, j]:
+                if reason[i, j] == _UNMARKED or 0 < reason[i, j] < reasons[p]:
                     reason[i, j] = reasons[p]

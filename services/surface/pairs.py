@@ -24,8 +24,8 @@ _HALVED_DAYS = 60.0
 _USED_AGAIN = 0.8
 """What an image that another pair uses leaves of the merit of a pair: their noise is not independent."""
 LEAST_SHOWN = 0.75
-"""Share of the merit of the best pair that others need, once coarse pixels have shown it: worse ones added
-noise to surfaces of four to ten pairs against lidar (benchmarks/surface.py)."""
+"""Share of the merit of the best pair that others need, once coarse pixels have shown it: worse
+ones added noise to surfaces of four to ten pairs against lidar (benchmarks/surface.py)."""
 _LEAST_OVERLAP = 0.02
 """Share of the smaller image that both have to show."""
 

@@ -18,6 +18,9 @@ from amers.services.types import Array, BoolArray, FloatImage
 
 _GROUND_NODES = 9
 """Nodes of the tile along each axis, at which the models are evaluated."""
+_FEWEST_NODES = 2 * _GROUND_NODES
+LEVELS = 3
+"""Heights between the lowest and the highest one, at which the models are evaluated."""
 _MARGIN_PX = 8
 """Pixels read beyond what is resampled, for the kernel and the low-pass."""
 
@@ -66,12 +69,16 @@ def rectify(
     axes = [np.linspace(-0.5, n - 0.5, _GROUND_NODES) for n in (lines, samples)]
     at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     xy, lon_lat = tile.xy(at), tile.lon_lat(at)
-    levels_m = np.linspace(*heights_m, 3)
+    levels_m = np.linspace(*heights_m, LEVELS)
     ground = np.concatenate([np.column_stack([lon_lat, np.full(len(at), h)]) for h in levels_m])
     xy_h = np.concatenate([np.column_stack([xy, np.full(len(at), h)]) for h in levels_m])
     a, b = first.project(ground)[:, ::-1], second.project(ground)[:, ::-1]
-    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+    # Models end somewhere, and a tile may reach farther.
+    reached = np.isfinite(a[:, 0] + b[:, 0]).reshape(LEVELS, -1).all(axis=0)
+    if reached.sum() < _FEWEST_NODES:
         return None
+    everywhere = np.tile(reached, LEVELS)
+    a, b, xy_h, at = a[everywhere], b[everywhere], xy_h[everywhere], at[reached]
     centre = np.concatenate([a.mean(axis=0), b.mean(axis=0)])
     normal = np.linalg.svd(np.column_stack([a, b]) - centre, full_matrices=False)[2][-1]
     scale = 1.0 / (np.hypot(*normal[:2]) * ratio)

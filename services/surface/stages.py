@@ -182,7 +182,10 @@ def fuse_task(
         sure = np.where(unsure, np.float32(np.nan), height_m)
         around, around_sigma_m = filled_gaps(sure, sigma_m, options.fill_cells)
         replaced = unsure & np.isfinite(around)
-        height_m, sigma_m = np.where(replaced, around, height_m), np.where(replaced, around_sigma_m, sigma_m)
+        height_m, sigma_m = (
+            np.where(replaced, around, height_m),
+            np.where(replaced, around_sigma_m, sigma_m),
+        )
         fused.views[replaced] = 0
     height_m, sigma_m = filled_gaps(height_m, sigma_m, options.fill_cells)
     sigma_m = np.hypot(sigma_m, roughness_m(height_m))

@@ -92,7 +92,7 @@ def make_surface(
         CoverageError: no two scenes see the same ground, or nothing of it was matched.
     """
     work = work or Work()
-    heights_m = options.heights_m or _common_heights(scenes)
+    heights_m = _heights_m(scenes, options)
     candidates = candidate_pairs(scenes, heights_m, options.bases)
     candidates = choose_pairs(candidates, _TRIED * options.pairs)
     grid = grid or grid_over(scenes, candidates, options.gsd_m)
@@ -127,13 +127,21 @@ def surface_tiles(surface: Surface, progress: Progress = no_progress) -> Iterato
         )
 
 
-def _common_heights(scenes: Sequence[Scene]) -> tuple[float, float]:
-    """Heights for which all models are meant."""
+def _heights_m(scenes: Sequence[Scene], options: SurfaceOptions) -> tuple[float, float]:
+    """Heights to look for: the stated ones, or those that all models are meant for."""
     ranges = np.array([scene.model.height_range_m for scene in scenes])
     low, high = float(ranges[:, 0].max()), float(ranges[:, 1].min())
     if not low < high:
         raise CoverageError(
             f"the models of the scenes are meant for different heights, {ranges.round().tolist()} m: "
-            "state the heights of the ground"
+            "they do not show the same ground"
         )
-    return low, high
+    if options.heights_m is None:
+        return low, high
+    stated_low, stated_high = options.heights_m
+    if stated_high <= low or stated_low >= high:
+        raise CoverageError(
+            f"heights from {stated_low:g} to {stated_high:g} m are stated, the models of the scenes are "
+            f"meant for {low:.0f} to {high:.0f} m above the ellipsoid: check the heights"
+        )
+    return options.heights_m

@@ -1,0 +1,190 @@
+"""Surfaces of real pairs and blocks beside lidar and beside the surface of another program.
+
+Needs AMERS_REAL_DATA, a folder with `wv3_jacksonville` (nine dates and a lidar surface) and
+`phr_calanques_triplet` (three views of one pass and the surface that S2P made of them), and a block of
+either with adjusted models, as `amers block produce` makes them. *Within 1 m* is the share of all cells
+of the lidar surface, also of those without a height; its vertical datum is not stated, so that the median
+is removed, and the horizontal offset is estimated to a cell. *Holds* are the shares of the 90 %
+intervals that contain the truth, of all cells and of those whose surroundings are flat.
+Run: python -m benchmarks.surface --town BLOCK --hills BLOCK
+"""
+
+import os
+
+# Read by Numba when it is first imported.
+os.environ["NUMBA_NUM_THREADS"] = "1"
+
+import argparse
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rasterio
+
+from amers.services.formats.images.scenes import read_scene
+from amers.services.map_grid import MapGrid
+from amers.services.surface.options import SurfaceOptions
+from amers.services.surface.surface import make_surface, surface_tiles
+from amers.services.types import Array, FloatImage
+from benchmarks._measuring import keep, memory_mib, print_table
+
+TOWN, HILLS = "wv3_jacksonville", "phr_calanques_triplet"
+SETS = {
+    "a week apart, B/H 0.61": (TOWN, ("001", "003")),
+    "a month apart, B/H 0.31": (TOWN, ("018", "019")),
+    "six weeks apart, B/H 0.48": (TOWN, ("016", "019")),
+    "one pass, B/H 0.19": (TOWN, ("009", "010")),
+    "three dates": (TOWN, ("016", "018", "019")),
+    "five dates": (TOWN, ("001", "003", "016", "018", "019")),
+    "nine dates": (TOWN, ("001", "003", "005", "009", "010", "012", "016", "018", "019")),
+    "pair of one pass": (HILLS, ("01", "03")),
+    "triplet of one pass": (HILLS, ("01", "02", "03")),
+}
+FLAT_M = 0.3
+"""Largest range of the truth within 5 x 5 cells of flat ground."""
+OFFSETS = range(-4, 5)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One surface beside the truth; see the module."""
+
+    scenes: str
+    fill_cells: int
+    pairs: int
+    covered: float
+    within_1_m: float
+    bias_m: float | None
+    nmad_m: float
+    flat_nmad_m: float
+    le90_m: float
+    holds: float
+    holds_flat: float
+    cpu_s: float
+    memory_mib: float
+
+
+def outcome(folder: Path, block: Path, name: str, fill_cells: int) -> Outcome:
+    """A surface of one set of scenes over the grid of the truth."""
+    data, numbers = SETS[name]
+    town = data == TOWN
+    truth_file = folder / data / ("lidar_west.tif" if town else "expected_output/dsm.tif")
+    truth, grid = read_truth(truth_file)
+    stems = [f"{'jax' if town else 'img'}_{number}" for number in numbers]
+    scenes = [
+        read_scene(folder / data / f"{stem}.tif", block / "models" / f"{stem}_RPC.TXT", sigma_m=1.0)
+        for stem in stems
+    ]
+    begun = time.process_time()
+    surface = make_surface(scenes, SurfaceOptions(fill_cells=fill_cells), grid=grid)
+    heights, sigmas = (np.full(grid.shape, np.nan, dtype=np.float32) for _ in range(2))
+    for tile in surface_tiles(surface):
+        w = tile.window
+        place = np.s_[w.line : w.line + w.lines, w.sample : w.sample + w.samples]
+        heights[place], sigmas[place] = tile.height_m, tile.sigma_m
+    cpu_s = time.process_time() - begun
+    error_m, sigma_m = (beside if town else straight)(heights, sigmas, truth)
+    known, flat = np.isfinite(error_m), np.isfinite(error_m) & flat_cells(truth)
+    hits = np.abs(error_m) < 1.6449 * sigma_m
+    return Outcome(
+        name,
+        fill_cells,
+        len(surface.pairs),
+        float(np.isfinite(heights).mean()),
+        float((np.abs(error_m[known]) < 1.0).sum() / np.isfinite(truth).sum()),
+        None if town else float(np.median(error_m[known])),
+        nmad(error_m[known]),
+        nmad(error_m[flat]),
+        float(np.quantile(np.abs(error_m[known]), 0.9)),
+        float(hits[known].mean()),
+        float(hits[flat].mean()),
+        cpu_s,
+        memory_mib("VmHWM"),
+    )
+
+
+def read_truth(path: Path) -> tuple[FloatImage, MapGrid]:
+    """The heights in a file, and their grid."""
+    with rasterio.open(path) as file:
+        truth = file.read(1, masked=True).astype(np.float32).filled(np.nan)
+        at, crs = file.transform, file.crs.to_wkt()
+    origin = np.array([at.c + at.a / 2.0, at.f + at.e / 2.0])
+    return truth, MapGrid(crs, origin, np.array([[0.0, at.a], [at.e, 0.0]]), truth.shape)
+
+
+def straight(heights: FloatImage, sigmas: FloatImage, truth: FloatImage) -> tuple[Array, Array]:
+    """Errors and sigmas where the datum and the place of the truth are known."""
+    return heights - truth, sigmas
+
+
+def beside(heights: FloatImage, sigmas: FloatImage, truth: FloatImage) -> tuple[Array, Array]:
+    """Errors and sigmas at the offset in whole cells that leaves the smallest errors, median removed."""
+
+    def at(down: int, right: int) -> tuple[float, Array, Array]:
+        matrix = np.array([[1.0, 0.0, right], [0.0, 1.0, down]])
+        moved = [
+            cv2.warpAffine(image, matrix, image.shape[::-1], flags=cv2.INTER_NEAREST, borderValue=np.nan)
+            for image in (heights, sigmas)
+        ]
+        error_m = moved[0] - truth
+        error_m -= np.nanmedian(error_m)
+        return float(np.nanmean(np.minimum(np.abs(error_m), 2.0))), error_m, np.asarray(moved[1])
+
+    tried = (at(down, right) for down in OFFSETS for right in OFFSETS)
+    return min(tried, key=lambda one: one[0])[1:]
+
+
+def flat_cells(truth: FloatImage) -> Array:
+    """Where the truth varies by less than `FLAT_M` around."""
+    extent = cv2.morphologyEx(np.nan_to_num(truth, nan=1e6), cv2.MORPH_GRADIENT, np.ones((5, 5)))
+    return np.asarray(extent < FLAT_M)
+
+
+def nmad(errors: Array) -> float:
+    """Robust standard deviation around the median."""
+    return float(1.4826 * np.median(np.abs(errors - np.median(errors))))
+
+
+def main() -> None:
+    """Make all surfaces, with gaps and filled, and print them."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--town", type=Path, required=True, help=f"block of {TOWN}")
+    parser.add_argument("--hills", type=Path, required=True, help=f"block of {HILLS}")
+    parser.add_argument("--only", help="part of the names of the sets")
+    arguments = parser.parse_args()
+    folder = Path(os.environ["AMERS_REAL_DATA"])
+    blocks = {TOWN: arguments.town, HILLS: arguments.hills}
+    names = [name for name in SETS if (arguments.only or "") in name]
+    outcome(folder, blocks[SETS[names[0]][0]], names[0], 0)  # compiles
+    outcomes = [
+        outcome(folder, blocks[SETS[name][0]], name, cells)
+        for name in names
+        for cells in (0, SurfaceOptions().fill_cells)
+    ]
+    keep("surface", [asdict(one) for one in outcomes])
+    print_table(
+        "Surfaces",
+        outcomes,
+        {
+            "scenes": lambda one: one.scenes,
+            "filled": lambda one: f"{one.fill_cells} cells",
+            "pairs": lambda one: one.pairs,
+            "covered": lambda one: f"{one.covered:.3f}",
+            "within 1 m": lambda one: f"{one.within_1_m:.3f}",
+            "bias, m": lambda one: None if one.bias_m is None else f"{one.bias_m:+.3f}",
+            "NMAD, m": lambda one: f"{one.nmad_m:.3f}",
+            "flat, m": lambda one: f"{one.flat_nmad_m:.3f}",
+            "LE90, m": lambda one: f"{one.le90_m:.2f}",
+            "holds": lambda one: f"{one.holds:.2f}",
+            "holds, flat": lambda one: f"{one.holds_flat:.2f}",
+            "CPU s": lambda one: f"{one.cpu_s:.1f}",
+            "MiB": lambda one: f"{one.memory_mib:.0f}",
+        },
+        width=140,
+    )
+
+
+if __name__ == "__main__":
+    main()
