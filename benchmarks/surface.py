@@ -2,9 +2,9 @@
 
 Needs AMERS_REAL_DATA, a folder with `wv3_jacksonville` (nine dates and a lidar surface) and
 `phr_calanques_triplet` (three views of one pass and the surface that S2P made of them), and a block of
-either with adjusted models, as `amers block produce` makes them. *Within 1 m* is the share of all cells
-of the lidar surface, also of those without a height; its vertical datum is not stated, so that the median
-is removed, and the horizontal offset is estimated to a cell. *Holds* are the shares of the 90 %
+either with adjusted models, as `amers production run` makes them. *Within 1 m* is the share of all cells
+of the lidar surface, also of those without a height; its vertical datum is not stated, so that the
+median is removed, and the horizontal offset is estimated to a cell. *Holds* are the shares of the 90 %
 intervals that contain the truth, of all cells and of those whose surroundings are flat.
 Run: python -m benchmarks.surface --town BLOCK --hills BLOCK
 """

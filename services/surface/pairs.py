@@ -23,7 +23,7 @@ _HALVED_DAYS = 60.0
 """Days between two images after which a pair is half as good: seasons, leaves, cars (the same dates)."""
 _USED_AGAIN = 0.8
 """What an image that another pair uses leaves of the merit of a pair: their noise is not independent."""
-LEAST_SHOWN = 0.75
+LEAST_SHOWN = 0.85
 """Share of the merit of the best pair that others need, once coarse pixels have shown it: worse
 ones added noise to surfaces of four to ten pairs against lidar (benchmarks/surface.py)."""
 _LEAST_OVERLAP = 0.02
