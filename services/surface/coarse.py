@@ -23,7 +23,7 @@ COARSE = 4
 """Pixels of the images for each pixel of this search."""
 AGREES_CELLS = 3.0
 """Distance of a height of a pair from the median of all up to which it agrees, cells of the surface: 1 m
-for images of 0.35 m, which tells good pairs from those of other seasons (benchmarks/surface.py)."""
+for images of 0.35 m, which tells good pairs from those of other seasons in one town."""
 _REACH_CELLS = 1.5
 _BELOW_M, _ABOVE_M = 10.0, 30.0
 """Heights below and above those found that are looked for later: coarse pixels do not show towers."""

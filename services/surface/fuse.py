@@ -16,7 +16,7 @@ from amers.services.types import Array, BoolArray, FloatImage, IntArray
 
 DISPARITY_SIGMA_PX = 0.25
 """Noise of a disparity on flat ground, one standard deviation: 0.24 to 0.29 px for pairs of WorldView-3
-images of a town against lidar (benchmarks/surface.py)."""
+images of a town against lidar in one town."""
 _SHARED = 0.5
 """Correlation of the noise of two pairs with a common image: half of the noise is of that image."""
 _STEEPEST = 1.0
@@ -28,12 +28,12 @@ _AROUND_CELLS = 9
 """Side of the square around a cell whose roughness counts, cells."""
 _ROUGHNESS_COUNTS = 1.5
 """How much of the roughness is error: the 90 % intervals of pairs and of fused surfaces hold 0.82 to
-0.89 of all heights in a town with it, 0.77 to 0.85 with 1 (benchmarks/surface.py)."""
+0.89 of all heights in a town with it, 0.77 to 0.85 with 1; chosen there."""
 _SAME_M = 1.0
 """Heights of pairs that differ by less are of one surface."""
 _ENOUGH, _ENOUGH_SHARE = 2, 1.0 / 3.0
 """Pairs that have to agree on a surface, and their share of those that see the place: heights that one
-pair of several has are wrong more often than those around them (lidar, benchmarks/surface.py)."""
+pair of several has are wrong more often than those around them (lidar in one town)."""
 Counts = npt.NDArray[np.uint8]
 
 
@@ -69,7 +69,7 @@ def roughness_m(height_m: FloatImage) -> FloatImage:
     """Standard deviation (lines, samples) of the heights around a cell from the plane through them.
 
     Heights next to a wall may be those of its other side, and crowns of trees are blurred: by as much as
-    the heights around vary, as lidar shows (benchmarks/surface.py).
+    the heights around vary, as lidar of one town shows.
     """
     known = np.isfinite(height_m)
     level = float(np.mean(height_m[known])) if known.any() else 0.0

@@ -16,7 +16,7 @@ from amers.services.types import Array
 
 BEST_BASE = 0.45
 """Base over height of the pairs that are preferred: with less, noise weighs more; with more, more of the
-ground is hidden from one of both (nine dates of WorldView-3 against lidar, benchmarks/surface.py)."""
+ground is hidden from one of both (seen on nine dates of WorldView-3 against lidar)."""
 _BASE_SPREAD = 0.5
 """How fast the preference falls, as the standard deviation of the logarithm of the base."""
 _HALVED_DAYS = 60.0
@@ -25,7 +25,7 @@ _USED_AGAIN = 0.8
 """What an image that another pair uses leaves of the merit of a pair: their noise is not independent."""
 LEAST_SHOWN = 0.85
 """Share of the merit of the best pair that others need, once coarse pixels have shown it: worse
-ones added noise to surfaces of four to ten pairs against lidar (benchmarks/surface.py)."""
+ones added noise to surfaces of four to ten pairs against lidar in one town."""
 _LEAST_OVERLAP = 0.02
 """Share of the smaller image that both have to show."""
 
