@@ -94,14 +94,23 @@ def command_of(process: int) -> bytes:
 
 
 def users_of(file: Path) -> list[int]:
-    pids = set()
-    for link in Path("/proc").glob("[0-9]*/fd/*"):
-        try:
-            if link.samefile(file):
-                pids.add(int(link.parts[2]))
-        except OSError:
-            continue
-    return sorted(pids)
+    """The processes that have the file open, but those that end while they are looked at."""
+    return sorted(int(process.name) for process in Path("/proc").glob("[0-9]*") if _has_open(process, file))
+
+
+def _has_open(process: Path, file: Path) -> bool:
+    try:
+        links = list((process / "fd").iterdir())
+    except OSError:
+        return False
+    return any(_is_same(link, file) for link in links)
+
+
+def _is_same(link: Path, file: Path) -> bool:
+    try:
+        return link.samefile(file)
+    except OSError:
+        return False
 
 
 def until(condition) -> bool:

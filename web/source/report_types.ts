@@ -306,6 +306,7 @@ export interface RunRecord {
   method: "control points" | "reference image";
   blocks: BlockUsed[];
   options: RegistrationOptions;
+  statements: Statement[];
 }
 
 export interface SceneRecord {
@@ -351,6 +352,17 @@ export interface StatedAccuracy {
   ce90_m: number | null;
   le90_m: number | null;
   words: string;
+}
+
+export interface Statement {
+  file: string;
+  subject: "sensor model" | "place in the full image" | "pixel origin" | "horizontal datum" | "vertical datum" | "unit" | "epoch" | "order of values" | "valid pixels" | "bands" | "identity" | "accuracy";
+  use: "used" | "assumed" | "not used";
+  value: string;
+  where: string;
+  note: string;
+  more_files: number;
+  is_usual: boolean;
 }
 
 export interface Statistics {
