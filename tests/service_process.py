@@ -95,7 +95,9 @@ def command_of(process: int) -> bytes:
 
 def users_of(file: Path) -> list[int]:
     """The processes that have the file open, but those that end while they are looked at."""
-    return sorted(int(process.name) for process in Path("/proc").glob("[0-9]*") if _has_open(process, file))
+    return sorted(
+        int(process.name) for process in Path("/proc").glob("[0-9]*") if _has_open(process, file)
+    )
 
 
 def _has_open(process: Path, file: Path) -> bool:
