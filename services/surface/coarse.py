@@ -12,12 +12,13 @@ from amers.services.errors import CoverageError
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import Window
 from amers.services.map_grid import MapGrid
+from amers.services.surface.match import Reason
 from amers.services.surface.options import SurfaceOptions
 from amers.services.surface.pair_surface import cells_of_pair, match_task, pair_surface
-from amers.services.surface.pairs import Pair
+from amers.services.surface.pairs import Pair, pairs_over
 from amers.services.surface.tiles import LARGEST_TILE, MARGIN_CELLS, coarser, part_of_grid, windows_of
 from amers.services.tasks import Work
-from amers.services.types import Array, FloatImage, Progress
+from amers.services.types import Array, BoolArray, FloatImage, Progress
 
 COARSE = 4
 """Pixels of the images for each pixel of this search."""
@@ -28,6 +29,10 @@ _REACH_CELLS = 1.5
 _BELOW_M, _ABOVE_M = 10.0, 30.0
 """Heights below and above those found that are looked for later: coarse pixels do not show towers."""
 _FEWEST = 4
+_AROUND_CELLS = 8
+"""Cells around a window of the surface that this search looks at."""
+TRIED = 3
+"""Pairs that are tried with coarse pixels, for each one that is used."""
 
 
 @dataclass(frozen=True)
@@ -37,14 +42,16 @@ class CoarseHeights:
     Attributes:
         grid: of its cells.
         heights: (p, lines, samples) of the pairs; NaN where they have none.
+        looked_at: (p, lines, samples) where each pair was matched.
     """
 
     grid: MapGrid
     heights: FloatImage
+    looked_at: BoolArray
 
     def of(self, pairs: Sequence[int]) -> "CoarseHeights":
         """The same of some pairs."""
-        return CoarseHeights(self.grid, self.heights[list(pairs)])
+        return CoarseHeights(self.grid, self.heights[list(pairs)], self.looked_at[list(pairs)])
 
     @property
     def middle(self) -> FloatImage:
@@ -61,10 +68,14 @@ class CoarseHeights:
             return np.asarray(np.nanmedian(self.heights - self.middle, axis=(1, 2)))
 
     def agreement(self, within_m: float) -> Array:
-        """Share (p,) of the cells that any pair has in which each pair agrees with the median of all."""
+        """Share (p,) of the cells where each pair was matched in which it agrees with the median of all.
+
+        Cells that no pair has do not count.
+        """
         middle = self.middle
         off_m = np.abs(self.heights - self.offset_m[:, None, None] - middle)
-        return np.asarray((off_m < within_m).sum(axis=(1, 2)) / np.isfinite(middle).sum())
+        seen = (self.looked_at & np.isfinite(middle)).sum(axis=(1, 2))
+        return np.asarray((off_m < within_m).sum(axis=(1, 2)) / np.maximum(seen, 1))
 
     def around(self, tile: MapGrid) -> tuple[float, float] | None:
         """Heights to look for on a tile of the surface; None where none was found on or next to it."""
@@ -97,30 +108,32 @@ class CoarseSearch:
     heights_m: tuple[float, float]
     options: SurfaceOptions
 
-    def over(self, grid: MapGrid, work: Work, progress: Progress) -> CoarseHeights:
-        """The heights of all pairs over the grid of a surface.
+    def over(
+        self, grid: MapGrid, windows: Sequence[Window] | None, work: Work, progress: Progress
+    ) -> CoarseHeights:
+        """The heights of all pairs over the grid of a surface, or over windows of it.
 
         Raises:
             CoverageError: nothing of it was matched.
         """
         coarse = coarser(grid, COARSE)
-        windows = windows_of(coarse.shape, LARGEST_TILE // 2)
-        numbers = range(len(self.pairs))
-        tasks = [
-            (_name(window, number), partial(self._arguments, coarse, window, self.pairs[number]))
-            for window in windows
-            for number in numbers
-        ]
+        if windows is None:
+            windows = windows_of(coarse.shape, LARGEST_TILE // 2)
+        else:
+            windows = [_coarse(window, coarse.shape) for window in windows]
+        of_windows = pairs_over(self.pairs, coarse, windows, TRIED * self.options.pairs)
+        looks = [(w, n) for w, own in zip(windows, of_windows, strict=True) for n in own]
+        tasks = [(_name(w, n), partial(self._arguments, coarse, w, self.pairs[n])) for w, n in looks]
         work.run(match_task, tasks, progress)
         heights = np.full((len(self.pairs), *coarse.shape), np.nan, dtype=np.float32)
-        for w in windows:
-            place = np.s_[w.line : w.line + w.lines, w.sample : w.sample + w.samples]
-            part = part_of_grid(coarse, w, 0)
-            for number in numbers:
-                found = pair_surface(work.kept[_name(w, number)])
-                if found is not None:
-                    cells, _ = cells_of_pair(found, part, np.zeros(3), _REACH_CELLS)
-                    heights[number][place] = cells
+        looked_at = np.zeros(heights.shape, dtype=np.bool_)
+        for w, number in looks:
+            found = pair_surface(work.kept[_name(w, number)])
+            if found is not None:
+                place = np.s_[w.line : w.line + w.lines, w.sample : w.sample + w.samples]
+                cells, why = cells_of_pair(found, part_of_grid(coarse, w, 0), np.zeros(3), _REACH_CELLS)
+                heights[number][place] = cells
+                looked_at[number][place] = why != Reason.OUTSIDE
         if not np.isfinite(heights).any():
             low_m, high_m = self.heights_m
             raise CoverageError(
@@ -128,7 +141,7 @@ class CoarseSearch:
                 f"between {low_m:.0f} and {high_m:.0f} m, and that their models agree (register them "
                 "first)"
             )
-        return CoarseHeights(coarse, heights)
+        return CoarseHeights(coarse, heights, looked_at)
 
     def _arguments(self, coarse: MapGrid, window: Window, pair: Pair) -> tuple[Any, ...]:
         matcher = self.options.matcher
@@ -138,5 +151,14 @@ class CoarseSearch:
         return scenes, part, self.heights_m, float(COARSE), small
 
 
+def _coarse(window: Window, shape: tuple[int, int]) -> Window:
+    """The window of the grid of this search around one of the surface."""
+    first = [max(n // COARSE - _AROUND_CELLS, 0) for n in (window.line, window.sample)]
+    ends = (window.line + window.lines, window.sample + window.samples)
+    last = [min(-(-n // COARSE) + _AROUND_CELLS, most) for n, most in zip(ends, shape, strict=True)]
+    return Window(first[0], first[1], last[0] - first[0], last[1] - first[1])
+
+
 def _name(window: Window, number: int) -> str:
-    return f"coarse/{window.line:06d}-{window.sample:06d}-{number:03d}"
+    place = f"{window.line:06d}-{window.sample:06d}-{window.lines}-{window.samples}"
+    return f"coarse/{place}-{number:03d}"

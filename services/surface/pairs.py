@@ -12,6 +12,8 @@ import shapely
 from amers.services.errors import CoverageError
 from amers.services.geodesy import ecef_from_east_north_up
 from amers.services.imagery.scene import Scene, scene_centre, scene_footprint, scene_gsd_m
+from amers.services.imagery.source import Window
+from amers.services.map_grid import MapGrid
 from amers.services.types import Array
 
 BEST_BASE = 0.45
@@ -30,7 +32,7 @@ _LEAST_OVERLAP = 0.02
 """Share of the smaller image that both have to show."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pair:
     """Two images that see the same ground.
 
@@ -105,6 +107,32 @@ def choose_pairs(candidates: Sequence[Pair], most: int, least: float = 0.0) -> l
         rest.remove(best)
         chosen.append(best)
         used.update((best.first, best.second))
+    return chosen
+
+
+def pairs_over(
+    candidates: Sequence[Pair],
+    grid: MapGrid,
+    windows: Sequence[Window],
+    most: int,
+    least: float = 0.0,
+) -> list[tuple[int, ...]]:
+    """Numbers of the best pairs that show each of some windows of a grid, ascending.
+
+    Args:
+        candidates: to choose from.
+        grid: of the windows.
+        windows: parts of it.
+        most: pairs at most of one window.
+        least: share of the merit of the best pair of a window that others need there.
+    """
+    tree = shapely.STRtree([shapely.Polygon(grid.line_sample(pair.overlap)) for pair in candidates])
+    chosen = []
+    for w in windows:
+        place = shapely.box(w.line, w.sample, w.line + w.lines, w.sample + w.samples)
+        seen = np.sort(tree.query(place, predicate="intersects")).tolist()
+        best = choose_pairs([candidates[n] for n in seen], most, least) if seen else []
+        chosen.append(tuple(n for n in seen if candidates[n] in best))
     return chosen
 
 

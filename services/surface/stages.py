@@ -50,17 +50,18 @@ class Stages:
     def match(self, tiles: Sequence[Tile], progress: Progress) -> None:
         """Keep the disparities of every pair on every tile."""
         tasks = [
-            (_pair_name(tile, number), partial(self._match_arguments, tile, pair))
+            (_pair_name(tile, number), partial(self._match_arguments, tile, self.pairs[number]))
             for tile in tiles
             if tile.heights_m is not None
-            for number, pair in enumerate(self.pairs)
+            for number in tile.pairs
         ]
         self.work.run(match_task, tasks, progress)
 
     def align(self, tiles: Sequence[Tile], offset_m: Array, progress: Progress) -> tuple[Array, Array]:
         """Shifts (p, 3) of the pairs, and the noise (p,) of their heights."""
         count = len(self.pairs)
-        least = DISPARITY_SIGMA_PX / np.array([self._px_per_m(tiles, k) for k in range(count)])
+        px_per_m = np.array([self._px_per_m(tiles, number) for number in range(count)])
+        least = np.nan_to_num(DISPARITY_SIGMA_PX / px_per_m, nan=np.inf)
         sigma_m = least
         shift = np.zeros((count, 3))
         shift[:, 2] = -np.nan_to_num(offset_m)
@@ -83,8 +84,8 @@ class Stages:
 
     def fuse_arguments(self, tile: Tile, shift_m: Array, sigma_m: Array) -> tuple[Any, ...]:
         """What `fuse_task` and `align_task` take."""
-        found = [self._surface(tile, number) for number in range(len(self.pairs))]
-        known = [(number, surface) for number, surface in enumerate(found) if surface is not None]
+        found = [(number, self._surface(tile, number)) for number in tile.pairs]
+        known = [(number, surface) for number, surface in found if surface is not None]
         images = np.array(
             [(self.pairs[n].first, self.pairs[n].second) for n, _ in known], dtype=np.int64
         ).reshape(-1, 2)
@@ -108,7 +109,7 @@ class Stages:
         return None if tile.heights_m is None else pair_surface(self.work.kept[_pair_name(tile, number)])
 
     def _px_per_m(self, tiles: Sequence[Tile], number: int) -> float:
-        surfaces = [self._surface(tile, number) for tile in tiles]
+        surfaces = [self._surface(tile, number) for tile in tiles if number in tile.pairs]
         known = [abs(surface.px_per_m) for surface in surfaces if surface is not None]
         return float(np.median(known)) if known else math.nan
 

@@ -13,15 +13,20 @@ from amers.services.map_grid import MapGrid
 from amers.services.surface.coarse import AGREES_CELLS, CoarseSearch
 from amers.services.surface.match import Reasons
 from amers.services.surface.options import SurfaceOptions
-from amers.services.surface.pairs import LEAST_SHOWN, Pair, candidate_pairs, choose_pairs
+from amers.services.surface.pairs import LEAST_SHOWN, Pair, candidate_pairs, pairs_over
 from amers.services.surface.stages import Stages, fuse_task
-from amers.services.surface.tiles import Tile, grid_over, tiles_of
+from amers.services.surface.tiles import (
+    LARGEST_TILE,
+    Tile,
+    grid_over,
+    largest_volume,
+    tiles_of,
+    windows_of,
+)
 from amers.services.tasks import Work
 from amers.services.types import Array, FloatImage, Progress, no_progress, part_of
 
 _DEFAULT = SurfaceOptions()
-_TRIED = 3
-"""Pairs that are tried with coarse pixels, for each one that is used."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +81,7 @@ def make_surface(
     options: SurfaceOptions = _DEFAULT,
     *,
     grid: MapGrid | None = None,
+    windows: Sequence[Window] | None = None,
     work: Work | None = None,
     progress: Progress = no_progress,
 ) -> Surface:
@@ -85,6 +91,7 @@ def make_surface(
         scenes: two or more, with models that agree: registered, or of one adjusted block.
         options: of the surface.
         grid: projected and north-up; by default in the UTM zone, over what two scenes show.
+        windows: parts of the grid that are made, which may overlap; by default all of it.
         work: computes the tasks and keeps their results; by default in this process, in memory.
         progress: receives the fraction done and a message.
 
@@ -94,15 +101,21 @@ def make_surface(
     work = work or Work()
     heights_m = _heights_m(scenes, options)
     candidates = candidate_pairs(scenes, heights_m, options.bases)
-    candidates = choose_pairs(candidates, _TRIED * options.pairs)
     grid = grid or grid_over(scenes, candidates, options.gsd_m)
     search = CoarseSearch(scenes, candidates, heights_m, options)
-    coarse = search.over(grid, work, part_of(progress, 0.0, 0.2))
+    coarse = search.over(grid, windows, work, part_of(progress, 0.0, 0.2))
     agreement = coarse.agreement(AGREES_CELLS * float(grid.step_xy[0, 1]))
     shown = [replace(p, merit=float(a)) for p, a in zip(candidates, agreement, strict=True)]
-    pairs = choose_pairs(shown, options.pairs, LEAST_SHOWN)
-    coarse = coarse.of([shown.index(pair) for pair in pairs])
-    tiles = tuple(tiles_of(grid, scenes, pairs, coarse.around, options))
+    windows = windows or windows_of(grid.shape, LARGEST_TILE)
+    best = pairs_over(shown, grid, windows, options.pairs, LEAST_SHOWN)
+    used = sorted({number for numbers in best for number in numbers})
+    pairs, coarse = [shown[number] for number in used], coarse.of(used)
+    volume = largest_volume(grid, scenes, pairs, options)
+    tiles = tuple(
+        replace(tile, pairs=tuple(used.index(number) for number in numbers))
+        for window, numbers in zip(windows, best, strict=True)
+        for tile in tiles_of(grid, window, coarse.around, volume)
+    )
     stages = Stages(tuple(scenes), tuple(pairs), grid, options, work)
     stages.match(tiles, part_of(progress, 0.2, 0.6))
     shift_m, sigma_m = stages.align(tiles, coarse.offset_m, part_of(progress, 0.8, 0.2))

@@ -31,10 +31,12 @@ class Tile:
     Attributes:
         window: of the grid.
         heights_m: that are looked for there; None where nothing was found around it.
+        pairs: numbers of those that it is made of, ascending.
     """
 
     window: Window
     heights_m: tuple[float, float] | None
+    pairs: tuple[int, ...] = ()
 
     @property
     def name(self) -> str:
@@ -86,41 +88,45 @@ def windows_of(shape: tuple[int, int], side: int) -> list[Window]:
     ]
 
 
-def tiles_of(
-    grid: MapGrid,
-    scenes: Sequence[Scene],
-    pairs: Sequence[Pair],
-    around: HeightsAround,
-    options: SurfaceOptions,
-) -> Iterator[Tile]:
-    """Tiles of the grid whose costs fit into the memory.
+def largest_volume(
+    grid: MapGrid, scenes: Sequence[Scene], pairs: Sequence[Pair], options: SurfaceOptions
+) -> float:
+    """Squared cells times metres of height of the largest tile whose costs fit into the memory.
 
     Args:
         grid: of the surface.
         scenes: of the pairs.
         pairs: that the surface is made of.
-        around: what is known of the heights.
         options: of the surface.
     """
     gsds_m = [scene_gsd_m(scenes[pair.first]) for pair in pairs]
     px_per_m = max(pair.base_to_height / gsd_m for pair, gsd_m in zip(pairs, gsds_m, strict=True))
     cell_px = float(grid.step_xy[0, 1]) / min(gsds_m)
-    most = TILE_BYTES / options.matcher.bytes_per_disparity()
-    waiting = windows_of(grid.shape, LARGEST_TILE)
+    # Rows lie askew to the map: the square around a turned square is twice as large.
+    return TILE_BYTES / options.matcher.bytes_per_disparity() / (2.0 * cell_px**2 * px_per_m)
+
+
+def tiles_of(grid: MapGrid, window: Window, around: HeightsAround, volume: float) -> Iterator[Tile]:
+    """Tiles of a window of the grid.
+
+    Args:
+        grid: of the surface.
+        window: of it.
+        around: what is known of the heights.
+        volume: of the largest tile; see `largest_volume`.
+    """
+    waiting = [window]
     while waiting:
-        window = waiting.pop(0)
-        heights_m = around(part_of_grid(grid, window, MARGIN_CELLS))
-        heights_m = heights_m or around(part_of_grid(grid, window, 4 * LARGEST_TILE))
+        part = waiting.pop(0)
+        heights_m = around(part_of_grid(grid, part, MARGIN_CELLS))
+        heights_m = heights_m or around(part_of_grid(grid, part, 4 * LARGEST_TILE))
         if heights_m is None:
-            yield Tile(window, None)
+            yield Tile(part, None)
             continue
-        side = max(window.lines, window.samples)
-        # Rows lie askew to the map: the square around a turned square is twice as large.
-        pixels = 2.0 * ((side + 2 * MARGIN_CELLS) * cell_px) ** 2
-        if pixels * (heights_m[1] - heights_m[0]) * px_per_m <= most or side <= _SMALLEST_TILE:
-            yield Tile(window, heights_m)
+        side = max(part.lines, part.samples)
+        squares = float(side + 2 * MARGIN_CELLS) ** 2
+        if squares * (heights_m[1] - heights_m[0]) <= volume or side <= _SMALLEST_TILE:
+            yield Tile(part, heights_m)
             continue
-        inner = windows_of((window.lines, window.samples), math.ceil(side / 2))
-        waiting[:0] = [
-            replace(one, line=one.line + window.line, sample=one.sample + window.sample) for one in inner
-        ]
+        inner = windows_of((part.lines, part.samples), math.ceil(side / 2))
+        waiting[:0] = [replace(w, line=w.line + part.line, sample=w.sample + part.sample) for w in inner]
