@@ -15,7 +15,7 @@ from amers.app.errors import InputError
 from amers.app.usecases.executors import ComputeOptions
 from amers.app.usecases.image_production import WorkPlace
 from amers.app.usecases.surface import SurfaceFiles, run_surface
-from amers.services.surface.options import SurfaceOptions
+from amers.services.surface.options import MOST_FILL_CELLS, SurfaceOptions
 
 Files = Annotated[SurfaceFiles, Shown(images=typer.Argument(exists=True), registered=None, block=None)]
 
@@ -35,7 +35,7 @@ class MadeOptions:
     gsd_m: Annotated[float | None, typer.Option(min=0.01)] = None
     heights_m: str | None = None
     pairs: Annotated[int, typer.Option(min=1)] = 10
-    fill_cells: Annotated[int, typer.Option(min=0, max=20)] = 20
+    fill_cells: Annotated[int, typer.Option(min=0, max=MOST_FILL_CELLS)] = MOST_FILL_CELLS
 
     def options(self) -> SurfaceOptions:
         """The same as the service takes it.

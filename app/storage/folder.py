@@ -260,6 +260,21 @@ class Storage:
                 if self.look() != place and self.look_closely()[1] is None:
                     (self.folder / UNFINISHED).rmdir()
 
+    @contextmanager
+    def lasting_folder(self, name: str) -> Iterator[Path]:
+        """A folder in `scratch` that stays after the context, and is not swept before its end."""
+        with self.proven():
+            folder = self.scratch() / name
+            folder.mkdir(mode=0o700, exist_ok=True)
+            with locked(folder):
+                yield folder
+
+    def forget_folder(self, name: str) -> None:
+        """Delete a folder of `lasting_folder`, if there is one."""
+        for folder in self.unfinished(name):
+            self.prove()
+            shutil.rmtree(folder, ignore_errors=True)
+
     def fetch(self, key: str, folder: Path) -> Path:
         """The path of a file on this machine, for libraries that open files; do not change the file.
 

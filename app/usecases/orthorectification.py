@@ -151,24 +151,26 @@ class MapLimits:
 
     room_bytes: int | None
 
-    def check(self, scene: Scene, grid: MapGrid, pixel_bytes: int) -> None:
-        """Refuse a map that the scene or the quota does not warrant.
+    def check(self, scenes: Sequence[Scene], grid: MapGrid, pixel_bytes: int) -> None:
+        """Refuse a map that the scenes or the quota do not warrant.
 
         Args:
+            scenes: that the map is made from.
+            grid: of the map.
             pixel_bytes: size of a pixel with all its bands.
 
         Raises:
-            InputError: the map is finer than the scene, or larger.
+            InputError: the map is finer than the finest scene, or larger than all of them.
             TooLarge: the map does not fit into what is left of the quota.
         """
-        require_warranted_gsd(grid.gsd_m, scene_gsd_m(scene))
+        require_warranted_gsd(grid.gsd_m, min(scene_gsd_m(scene) for scene in scenes))
         lines, samples = grid.shape
-        most = MOST_MAP_PIXELS * math.prod(scene.image.shape)
+        most = MOST_MAP_PIXELS * sum(math.prod(scene.image.shape) for scene in scenes)
         if lines * samples > most:
             raise InputError(
                 f"the map would have {lines} x {samples} pixels, at most {most:,} are allowed "
-                f"({MOST_MAP_PIXELS} times the pixels of the scene): give a larger `gsd_m`, or a crs "
-                "for this part of the world"
+                f"({MOST_MAP_PIXELS} times the pixels of what it is made from): give a larger `gsd_m`, "
+                "or a crs for this part of the world"
             )
         # A third more with overviews; compression makes it smaller.
         size_bytes = lines * samples * pixel_bytes * 4 // 3
@@ -189,7 +191,7 @@ def require_warranted_gsd(gsd_m: float, of_scene_m: float) -> None:
     # The ground sampling of a scene differs a little from place to place.
     if gsd_m < 0.95 * finest_m:
         raise InputError(
-            f"map.gsd_m: {gsd_m:.4g} m found, at least {finest_m:.4g} m expected, half of the "
+            f"gsd_m: {gsd_m:.4g} m found, at least {finest_m:.4g} m expected, half of the "
             f"{of_scene_m:.4g} m of the scene: a finer map shows no more"
         )
 
@@ -236,7 +238,7 @@ def run_orthorectification(
     grid = choose_grid(scene, ground, ortho_map.crs, ortho_map.gsd_m)
     dtype, nodata = _pixel_type(raster)
     if limits is not None:
-        limits.check(scene, grid, len(bands) * np.dtype(dtype).itemsize)
+        limits.check([scene], grid, len(bands) * np.dtype(dtype).itemsize)
     counter = _DataPixels(partial(unseen, scene, ground))
     windows = counter.count(orthorectify(bands, scene.model, ground, grid, options, progress=progress))
     saturated = next(reversed(raster.saturated_values(1)), None)
@@ -300,7 +302,8 @@ def _check(connection: Connection, caller: Token, inputs: OrthorectifyScene) -> 
         raise InputError(f"map.gsd_m: {inputs.map.gsd_m:g} found, a length above 0 m expected")
     scene = scenes.find_scene(connection, inputs.scene)
     if scene is not None and scene.gsd_m is not None and inputs.map.gsd_m is not None:
-        require_warranted_gsd(inputs.map.gsd_m, scene.gsd_m)
+        with naming("map"):
+            require_warranted_gsd(inputs.map.gsd_m, scene.gsd_m)
     if inputs.map.crs is not None:
         with naming("map.crs"):
             check_map_code(inputs.map.crs)

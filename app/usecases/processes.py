@@ -67,6 +67,11 @@ def results_folder(job_id: UUID) -> str:
     return f"results/{job_id}"
 
 
+def work_folder(job_id: UUID) -> str:
+    """Name of the folder in which the attempts at a job on one machine keep what the next can use."""
+    return f"work-{job_id}"
+
+
 def result_name(key: str) -> str:
     """The name of a file among the results of its job, by its key in the storage."""
     return key.split("/", 3)[3]

@@ -18,7 +18,7 @@ from amers.app.storage import Storage
 from amers.app.usecases import quotas
 from amers.app.usecases.damage import named_by_row
 from amers.app.usecases.media_types import media_type
-from amers.app.usecases.processes import Work, results_folder
+from amers.app.usecases.processes import Work, results_folder, work_folder
 
 Transmission = Literal["value", "reference"]
 LARGEST_VALUE_BYTES = 16 << 20
@@ -67,6 +67,16 @@ def store_results(work: Work, files: Mapping[str, Path]) -> dict[str, str]:
         for file in stored.values():
             stored_files.record_result(connection, work.job.id, file.key, file.size_bytes, file.sha256)
     return {name: file.key for name, file in stored.items()}
+
+
+def discard_work(database: Database, storage: Storage, job_id: UUID) -> None:
+    """Delete what attempts at a job keep on this machine for the next one, once there is none."""
+    if not storage.unfinished(work_folder(job_id)):
+        return
+    with database.transaction() as connection:
+        job = jobs.find(connection, job_id)
+    if job is None or job.finished_at is not None:
+        storage.forget_folder(work_folder(job_id))
 
 
 def discard_attempt(database: Database, storage: Storage, job_id: UUID, attempt: int) -> None:

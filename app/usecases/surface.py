@@ -1,9 +1,9 @@
-"""Make a surface from scenes in files: read them with their refined models, write a GeoTIFF."""
+"""Make a surface from scenes: read those in files with their refined models, write a GeoTIFF."""
 
 import hashlib
 import pickle
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
@@ -24,6 +24,7 @@ from amers.services.formats.work_folder import WorkFolder
 from amers.services.imagery.scene import Scene
 from amers.services.map_grid import MapGrid
 from amers.services.orthorectification.rectify import OrthoWindow
+from amers.services.sensors.correction import CorrectedModel
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.statements import Statements, gathered
 from amers.services.surface.match import REASON_LABELS, Reason
@@ -50,6 +51,21 @@ class SurfaceFiles:
     images: tuple[Path, ...]
     registered: Path | None = None
     block: Path | None = None
+
+
+@dataclass(frozen=True)
+class SurfaceScene:
+    """A scene that a surface is made from.
+
+    Attributes:
+        scene: with the model to use, open.
+        name: of it, among the scenes of the surface.
+        image: what tells its image from others, as JSON.
+    """
+
+    scene: Scene
+    name: str
+    image: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -120,11 +136,37 @@ def run_surface(
         raise InputError(f"{output}: the output would replace an image; choose another name")
     with ExitStack() as stack:
         scenes = [_scene(image, files, stack) for image in files.images]
-        folder = place.folder or output.with_name(f"{output.name}.work")
-        kept = WorkFolder(folder, _inputs(files, scenes, options))
-        executor, ahead = stack.enter_context(open_executor(place.compute))
+        named = [scene_of_file(scene, image) for scene, image in zip(scenes, files.images, strict=True)]
+        return write_surface(named, output, options, place=place, progress=progress)
+
+
+def write_surface(
+    scenes: Sequence[SurfaceScene],
+    output: Path,
+    options: SurfaceOptions,
+    *,
+    grid: MapGrid | None = None,
+    place: WorkPlace,
+    progress: Progress = no_progress,
+) -> SurfaceFile:
+    """Make the surface of open scenes; see `run_surface`.
+
+    Args:
+        scenes: two or more.
+        output, options, place, progress: as `run_surface` takes them.
+        grid: of the surface; see `make_surface`.
+
+    Raises:
+        CoverageError: the scenes do not show the same ground, or nothing of it was matched.
+    """
+    opened = [one.scene for one in scenes]
+    folder = place.folder or output.with_name(f"{output.name}.work")
+    kept = WorkFolder(folder, surface_inputs(scenes, options))
+    with open_executor(place.compute) as (executor, ahead):
         work = Work(executor, kept, ahead)
-        surface = make_surface(scenes, options, work=work, progress=part_of(progress, 0.0, 0.85))
+        surface = make_surface(
+            opened, options, grid=grid, work=work, progress=part_of(progress, 0.0, 0.85)
+        )
         counter = _Cells()
         tiles = counter.count(surface_tiles(surface, part_of(progress, 0.85, 0.15)))
         crs = heights_crs(surface.grid)
@@ -150,11 +192,11 @@ def run_surface(
         lines,
         samples,
         float(surface.grid.step_xy[0, 1]),
-        tuple(_pairs(surface, scenes)),
+        tuple(_pairs(surface, [one.name for one in scenes])),
         counter.by_label(lines * samples),
         counter.median_sigma_m,
         dict(work.effort),
-        gathered(one for scene in scenes for one in scene.statements),
+        gathered(one for scene in opened for one in scene.statements),
     )
 
 
@@ -214,12 +256,22 @@ def _scene(image: Path, files: SurfaceFiles, stack: ExitStack) -> Scene:
     else:
         scene = read_scene(image, sigma_m=1.0)
     stack.callback(scene.image.close)  # type: ignore[attr-defined]
-    if isinstance(scene.model, OrthoModel):
+    refuse_ortho_image(scene, str(image))
+    return scene
+
+
+def refuse_ortho_image(scene: Scene, image: str) -> None:
+    """Refuse a scene that has no parallax.
+
+    Raises:
+        InputError: its model is a map grid.
+    """
+    model = scene.model.base if isinstance(scene.model, CorrectedModel) else scene.model
+    if isinstance(model, OrthoModel):
         raise InputError(
             f"{image}: an ortho-image on a map found, which has no parallax; an image with a sensor "
             "model is expected"
         )
-    return scene
 
 
 def _adjusted_model(block: Path, image: Path) -> Path:
@@ -232,26 +284,26 @@ def _adjusted_model(block: Path, image: Path) -> Path:
     raise InputError(f"{image}: no image of {block} with an adjusted model; its images: {known}")
 
 
-def _inputs(files: SurfaceFiles, scenes: Sequence[Scene], options: SurfaceOptions) -> dict[str, Any]:
+def scene_of_file(scene: Scene, image: Path) -> SurfaceScene:
+    """A scene whose image is a file, told from others by its path, size and time."""
+    fact = image.stat()
+    facts = {"file": str(image.resolve()), "bytes": fact.st_size, "modified": fact.st_mtime_ns}
+    return SurfaceScene(scene, scene.acquisition.image_id, facts)
+
+
+def surface_inputs(scenes: Sequence[SurfaceScene], options: SurfaceOptions) -> dict[str, Any]:
     """What the results of all tasks depend on."""
-    facts = [image.stat() for image in files.images]
     return {
         "version": version("amers"),
         "images": [
-            {
-                "file": str(image.resolve()),
-                "bytes": fact.st_size,
-                "modified": fact.st_mtime_ns,
-                "model": hashlib.sha256(pickle.dumps(scene.model)).hexdigest(),
-            }
-            for image, fact, scene in zip(files.images, facts, scenes, strict=True)
+            {**one.image, "model": hashlib.sha256(pickle.dumps(one.scene.model)).hexdigest()}
+            for one in scenes
         ],
         "options": asdict(options),
     }
 
 
-def _pairs(surface: Surface, scenes: Sequence[Scene]) -> Iterator[dict[str, Any]]:
-    names = [scene.acquisition.image_id for scene in scenes]
+def _pairs(surface: Surface, names: Sequence[str]) -> Iterator[dict[str, Any]]:
     for pair, shift_m, sigma_m in zip(surface.pairs, surface.shift_m, surface.sigma_m, strict=True):
         yield {
             "images": [names[pair.first], names[pair.second]],

@@ -108,6 +108,7 @@ class Attempts:
             log.info("%s", lost)
         try:
             results.discard_attempt(self.database, self._storage, job.id, job.attempt)
+            results.discard_work(self.database, self._storage, job.id)
         except (psycopg.Error, StorageOutage, OSError) as error:
             if (outage := outage_of(error)) is None:
                 raise

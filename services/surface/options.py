@@ -4,6 +4,9 @@ from dataclasses import dataclass, field
 
 from amers.services.surface.match import SemiGlobal
 
+MOST_FILL_CELLS = 20
+"""Gaps are filled from so far away at most: the results were measured with this reach."""
+
 
 @dataclass(frozen=True)
 class SurfaceOptions:
@@ -23,5 +26,5 @@ class SurfaceOptions:
     heights_m: tuple[float, float] | None = None
     pairs: int = 10
     bases: tuple[float, float] = (0.1, 0.9)
-    fill_cells: int = 20
+    fill_cells: int = MOST_FILL_CELLS
     matcher: SemiGlobal = field(default_factory=SemiGlobal)

@@ -122,6 +122,16 @@ def make_surface(
     return Surface(stages, shift_m, sigma_m, tiles)
 
 
+def surface_grid(scenes: Sequence[Scene], options: SurfaceOptions = _DEFAULT) -> MapGrid:
+    """The grid that a surface of some scenes has by default.
+
+    Raises:
+        CoverageError: no two scenes see the same ground.
+    """
+    candidates = candidate_pairs(scenes, _heights_m(scenes, options), options.bases)
+    return grid_over(scenes, candidates, options.gsd_m)
+
+
 def surface_tiles(surface: Surface, progress: Progress = no_progress) -> Iterator[SurfaceTile]:
     """The tiles of a surface, fused one after the other.
 

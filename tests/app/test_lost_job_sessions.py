@@ -29,6 +29,7 @@ from tests.app.job_queue import state_of
 from tests.app.ledger import job_runner
 from tests.app.session_relay import Ending, Relay, relayed
 from tests.app.store_commands import Installations, Place, fill, settings_of
+from tests.app.surface_world import write_pair
 from tests.app.test_lost_sessions import drawn, limited, new_database
 from tests.app.test_orthorectification import write_inputs
 from tests.app.test_vectors import drawn as drawn_vectors
@@ -95,6 +96,7 @@ def queue_jobs(dsn: str, made: Path) -> None:
         )
         image, dem = write_inputs(made)
         raw = upload(image)
+        pair = [upload(path) for path in write_pair(made)]
         pixels = drawn_vectors(made / "pixels.geojson", "LINESTRING (100.5 -50.5, 300.5 -250.5)")
         ground = drawn_vectors(made / "ground.geojson", "POINT (5.25 43.25)")
         for path in (dem, pixels, ground):
@@ -111,6 +113,7 @@ def queue_jobs(dsn: str, made: Path) -> None:
             "view-scene": {"scene": raw},
             "map-scene": {"scene": flat, "registration": done["jobID"]},
             "orthorectify": on_ground,
+            "make-surface": {"scenes": pair, "gsd_m": 2.0, "heights_m": [140.0, 180.0]},
             "correct-vectors": {**on_ground, "vectors": pixels.name, "sigma_m": SIGMA_M},
             "project-vectors": {**on_ground, "vectors": ground.name},
             "ingest-block": {"path": "new"},

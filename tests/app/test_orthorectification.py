@@ -204,7 +204,7 @@ def test_a_service_rectifies_a_scene_on_a_terrain_uploaded_beside_it(
     ("ortho_map", "quota_bytes", "error", "named"),
     [
         ({"gsd_m": 0.05}, None, "InputError", "a finer map shows no more"),
-        ({"gsd_m": 0.26}, None, "InputError", "3 times the pixels of the scene"),
+        ({"gsd_m": 0.26}, None, "InputError", "3 times the pixels of what it is made from"),
         ({}, 300_000, "TooLarge", "left of the storage quota"),
     ],
 )
