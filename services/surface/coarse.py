@@ -1,9 +1,10 @@
 """A search with coarse pixels: which pairs agree, and between which heights the surface lies."""
 
+import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,13 @@ from amers.services.errors import CoverageError
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import Window
 from amers.services.map_grid import MapGrid
-from amers.services.surface.match import Reason
+from amers.services.surface.match import DenseMatcher, Reason
 from amers.services.surface.options import SurfaceOptions
-from amers.services.surface.pair_surface import cells_of_pair, match_task, pair_surface
+from amers.services.surface.pair_surface import cells_of_pair, match_pair
 from amers.services.surface.pairs import Pair, pairs_over
 from amers.services.surface.tiles import LARGEST_TILE, MARGIN_CELLS, coarser, part_of_grid, windows_of
-from amers.services.tasks import Work
-from amers.services.types import Array, BoolArray, FloatImage, Progress
+from amers.services.tasks import Arrays, Work
+from amers.services.types import Array, BoolArray, FloatImage, IntArray, Progress
 
 COARSE = 4
 """Pixels of the images for each pixel of this search."""
@@ -29,6 +30,9 @@ _REACH_CELLS = 1.5
 _BELOW_M, _ABOVE_M = 10.0, 30.0
 """Heights below and above those found that are looked for later: coarse pixels do not show towers."""
 _FEWEST = 4
+_MOST_CELLS = 1_000_000
+"""Cells of a pair that tell its offset: all of images of 4,000 x 4,000 pixels, a part of larger ones, so
+that memory does not grow with them."""
 _AROUND_CELLS = 8
 """Cells around a window of the surface that this search looks at."""
 TRIED = 3
@@ -37,59 +41,106 @@ TRIED = 3
 
 @dataclass(frozen=True)
 class CoarseHeights:
-    """What the search with coarse pixels found.
+    """What the search with coarse pixels found; it is read part by part.
 
     Attributes:
         grid: of its cells.
-        heights: (p, lines, samples) of the pairs; NaN where they have none.
-        looked_at: (p, lines, samples) where each pair was matched.
+        windows: parts of the grid.
+        looks: numbers of the pairs that were matched on each part.
+        pairs: numbers of those that count; arrays with a row for each have this order.
+        kept: heights and where they were looked for, by the name of part and pair.
     """
 
     grid: MapGrid
-    heights: FloatImage
-    looked_at: BoolArray
+    windows: Sequence[Window]
+    looks: Sequence[tuple[int, ...]]
+    pairs: tuple[int, ...]
+    kept: Mapping[str, Arrays]
 
     def of(self, pairs: Sequence[int]) -> "CoarseHeights":
         """The same of some pairs."""
-        return CoarseHeights(self.grid, self.heights[list(pairs)], self.looked_at[list(pairs)])
+        return replace(self, pairs=tuple(self.pairs[number] for number in pairs))
 
     @property
-    def middle(self) -> FloatImage:
-        """Median (lines, samples) of the pairs."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # cells that no pair shows
-            return np.asarray(np.nanmedian(self.heights, axis=0))
+    def is_empty(self) -> bool:
+        """Whether no pair has a height anywhere."""
+        return not any(
+            np.isfinite(heights).any()
+            for row in range(len(self.windows))
+            for _, heights, _ in self._found(row)
+        )
 
-    @property
+    @cached_property
     def offset_m(self) -> Array:
         """Height (p,) by which each pair lies above the median of all; NaN for a pair without any."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)
-            return np.asarray(np.nanmedian(self.heights - self.middle, axis=(1, 2)))
+        step = math.ceil(math.sqrt(math.prod(self.grid.shape) / _MOST_CELLS))
+        off_m: list[list[FloatImage]] = [[] for _ in self.pairs]
+        for row in range(len(self.windows)):
+            found = [(number, heights[::step, ::step]) for number, heights, _ in self._found(row)]
+            middle = _middle([heights for _, heights in found])
+            for number, heights in found:
+                off = heights - middle
+                off_m[number].append(off[np.isfinite(off)])
+        known = [np.concatenate(parts) if parts else np.empty(0) for parts in off_m]
+        return np.array([np.median(values) if len(values) else np.nan for values in known])
 
     def agreement(self, within_m: float) -> Array:
         """Share (p,) of the cells where each pair was matched in which it agrees with the median of all.
 
         Cells that no pair has do not count.
         """
-        middle = self.middle
-        off_m = np.abs(self.heights - self.offset_m[:, None, None] - middle)
-        seen = (self.looked_at & np.isfinite(middle)).sum(axis=(1, 2))
-        return np.asarray((off_m < within_m).sum(axis=(1, 2)) / np.maximum(seen, 1))
+        agree, seen = np.zeros(len(self.pairs)), np.zeros(len(self.pairs))
+        for row in range(len(self.windows)):
+            found = list(self._found(row))
+            middle = _middle([heights for _, heights, _ in found])
+            for number, heights, looked_at in found:
+                seen[number] += (looked_at & np.isfinite(middle)).sum()
+                agree[number] += (np.abs(heights - self.offset_m[number] - middle) < within_m).sum()
+        return agree / np.maximum(seen, 1)
 
     def around(self, tile: MapGrid) -> tuple[float, float] | None:
         """Heights to look for on a tile of the surface; None where none was found on or next to it."""
         corners = np.array([[-0.5, -0.5], np.array(tile.shape) - 0.5])
         at = self.grid.line_sample_of_xy(tile.xy(corners))
-        first = np.maximum(np.floor(at.min(axis=0)).astype(int) - 4, 0)
+        first = np.floor(at.min(axis=0)).astype(int) - 4
         last = np.ceil(at.max(axis=0)).astype(int) + 5
-        part = self.heights[:, first[0] : last[0], first[1] : last[1]]
-        known = part[np.isfinite(part)]
-        if len(known) < _FEWEST:
+        begin, end = self._bounds
+        known = [np.empty(0, dtype=np.float32)]
+        for row in np.flatnonzero((begin < last).all(axis=1) & (end > first).all(axis=1)):
+            inner = np.maximum(first - begin[row], 0), last - begin[row]
+            place = np.s_[inner[0][0] : inner[1][0], inner[0][1] : inner[1][1]]
+            for _, heights, _ in self._found(int(row)):
+                part = heights[place]
+                known.append(part[np.isfinite(part)])
+        values = np.concatenate(known)
+        if len(values) < _FEWEST:
             return None
         # One height in two hundred may be wrong on either side.
-        low, high = np.quantile(known, [0.005, 0.995])
+        low, high = np.quantile(values, [0.005, 0.995])
         return float(low) - _BELOW_M, float(high) + _ABOVE_M
+
+    @cached_property
+    def _bounds(self) -> tuple[IntArray, IntArray]:
+        """First line and sample (n, 2) of every part, and those after its last ones."""
+        begin = np.array([(w.line, w.sample) for w in self.windows])
+        return begin, begin + np.array([(w.lines, w.samples) for w in self.windows])
+
+    def _found(self, row: int) -> Iterator[tuple[int, FloatImage, BoolArray]]:
+        """Place of each pair in `pairs`, heights (lines, samples) on a part, where it was matched."""
+        for number, pair in enumerate(self.pairs):
+            if pair in self.looks[row]:
+                arrays = self.kept[_name(self.windows[row], pair)]
+                if arrays:
+                    yield number, arrays["heights"], arrays["looked_at"]
+
+
+def _middle(heights: Sequence[FloatImage]) -> FloatImage:
+    """Median (lines, samples) of the heights of some pairs; NaN where none has one."""
+    if not heights:
+        return np.empty((0, 0), dtype=np.float32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # cells that no pair shows
+        return np.asarray(np.nanmedian(np.stack(heights), axis=0))
 
 
 @dataclass(frozen=True)
@@ -122,33 +173,39 @@ class CoarseSearch:
         else:
             windows = [_coarse(window, coarse.shape) for window in windows]
         of_windows = pairs_over(self.pairs, coarse, windows, TRIED * self.options.pairs)
-        looks = [(w, n) for w, own in zip(windows, of_windows, strict=True) for n in own]
-        tasks = [(_name(w, n), partial(self._arguments, coarse, w, self.pairs[n])) for w, n in looks]
-        work.run(match_task, tasks, progress)
-        heights = np.full((len(self.pairs), *coarse.shape), np.nan, dtype=np.float32)
-        looked_at = np.zeros(heights.shape, dtype=np.bool_)
-        for w, number in looks:
-            found = pair_surface(work.kept[_name(w, number)])
-            if found is not None:
-                place = np.s_[w.line : w.line + w.lines, w.sample : w.sample + w.samples]
-                cells, why = cells_of_pair(found, part_of_grid(coarse, w, 0), np.zeros(3), _REACH_CELLS)
-                heights[number][place] = cells
-                looked_at[number][place] = why != Reason.OUTSIDE
-        if not np.isfinite(heights).any():
+        tasks = [
+            (_name(window, number), partial(self._arguments, coarse, window, self.pairs[number]))
+            for window, numbers in zip(windows, of_windows, strict=True)
+            for number in numbers
+        ]
+        work.run(look_task, tasks, progress)
+        found = CoarseHeights(coarse, windows, of_windows, tuple(range(len(self.pairs))), work.kept)
+        if found.is_empty:
             low_m, high_m = self.heights_m
             raise CoverageError(
                 "no pair of scenes was matched anywhere: check that the scenes show the same ground "
                 f"between {low_m:.0f} and {high_m:.0f} m, and that their models agree (register them "
                 "first)"
             )
-        return CoarseHeights(coarse, heights, looked_at)
+        return found
 
     def _arguments(self, coarse: MapGrid, window: Window, pair: Pair) -> tuple[Any, ...]:
         matcher = self.options.matcher
         small = replace(matcher, smallest_patch_px=matcher.smallest_patch_px // COARSE)
-        part = part_of_grid(coarse, window, MARGIN_CELLS // 2)
         scenes = self.scenes[pair.first], self.scenes[pair.second]
-        return scenes, part, self.heights_m, float(COARSE), small
+        return scenes, part_of_grid(coarse, window, 0), self.heights_m, small
+
+
+def look_task(
+    scenes: tuple[Scene, Scene], cells: MapGrid, heights_m: tuple[float, float], matcher: DenseMatcher
+) -> Arrays:
+    """Heights (lines, samples) of a pair in some cells, and where it was matched; none without both."""
+    around = part_of_grid(cells, Window(0, 0, *cells.shape), MARGIN_CELLS // 2)
+    found = match_pair(scenes, around, heights_m, float(COARSE), matcher)
+    if found is None:
+        return {}
+    heights, why = cells_of_pair(found, cells, np.zeros(3), _REACH_CELLS)
+    return {"heights": heights, "looked_at": why != Reason.OUTSIDE}
 
 
 def _coarse(window: Window, shape: tuple[int, int]) -> Window:

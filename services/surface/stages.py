@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from amers.services.imagery.scene import Scene
 from amers.services.map_grid import MapGrid
@@ -72,15 +73,21 @@ class Stages:
                 for name, tile in zip(names, tiles, strict=True)
             ]
             self.work.run(align_task, tasks, part_of(progress, turn / _ROUNDS, 1.0 / _ROUNDS))
-            sums = [self.work.kept[name] for name in names]
             normal, right, distances = (
-                np.sum([one[part] for one in sums], axis=0) for part in ("normal", "right", "distances")
+                self._summed(names, part) for part in ("normal", "right", "distances")
             )
             for number in np.flatnonzero(normal[:, 2, 2] >= _FEWEST_CELLS):
                 shift[number] += np.linalg.solve(normal[number], right[number])
             sigma_m = np.maximum(least, noise_of_distances(distances))
             shift -= np.average(shift, axis=0, weights=sigma_m**-2.0)
         return shift, sigma_m
+
+    def _summed(self, names: Sequence[str], part: str) -> npt.NDArray[Any]:
+        """The sum of an array of some results, one of which is open at a time."""
+        total = np.array(self.work.kept[names[0]][part])
+        for name in names[1:]:
+            total += self.work.kept[name][part]
+        return total
 
     def fuse_arguments(self, tile: Tile, shift_m: Array, sigma_m: Array) -> tuple[Any, ...]:
         """What `fuse_task` and `align_task` take."""
@@ -109,7 +116,8 @@ class Stages:
         return None if tile.heights_m is None else pair_surface(self.work.kept[_pair_name(tile, number)])
 
     def _px_per_m(self, tiles: Sequence[Tile], number: int) -> float:
-        surfaces = [self._surface(tile, number) for tile in tiles if number in tile.pairs]
+        # One after the other: each keeps files of the work folder open.
+        surfaces = (self._surface(tile, number) for tile in tiles if number in tile.pairs)
         known = [abs(surface.px_per_m) for surface in surfaces if surface is not None]
         return float(np.median(known)) if known else math.nan
 
