@@ -133,21 +133,24 @@ def surface_grid(scenes: Sequence[Scene], options: SurfaceOptions = _DEFAULT) ->
 
 
 def surface_tiles(surface: Surface, progress: Progress = no_progress) -> Iterator[SurfaceTile]:
-    """The tiles of a surface, fused one after the other.
+    """The tiles of a surface, fused as many at once as the work is ahead.
 
     Args:
         surface: matched and aligned.
         progress: receives the fraction done.
     """
-    stages = surface.stages
-    for number, tile in enumerate(surface.tiles):
-        progress(number / len(surface.tiles), f"fuse: {number} of {len(surface.tiles)}")
-        arguments = partial(stages.fuse_arguments, tile, surface.shift_m, surface.sigma_m)
-        stages.work.run(fuse_task, [(f"fuse/{tile.name}", arguments)])
-        found = stages.work.kept[f"fuse/{tile.name}"]
-        yield SurfaceTile(
-            tile.window, found["height_m"], found["sigma_m"], found["views"], found["reason"]
-        )
+    stages, ahead = surface.stages, surface.stages.work.ahead
+    for first in range(0, len(surface.tiles), ahead):
+        progress(first / len(surface.tiles), f"fuse: {first} of {len(surface.tiles)}")
+        group = surface.tiles[first : first + ahead]
+        place = (surface.shift_m, surface.sigma_m)
+        tasks = [(f"fuse/{tile.name}", partial(stages.fuse_arguments, tile, *place)) for tile in group]
+        stages.work.run(fuse_task, tasks)
+        for tile in group:
+            found = stages.work.kept[f"fuse/{tile.name}"]
+            yield SurfaceTile(
+                tile.window, found["height_m"], found["sigma_m"], found["views"], found["reason"]
+            )
 
 
 def _heights_m(scenes: Sequence[Scene], options: SurfaceOptions) -> tuple[float, float]:
