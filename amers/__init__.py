@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from amers.tasks import register as register
     from amers.tasks import register_on_reference as register_on_reference
     from amers.tasks import register_together as register_together
+    from amers.tasks import surface as surface
 
 __all__ = [
     "AmersError",
@@ -58,6 +59,7 @@ __all__ = [
     "register",
     "register_on_reference",
     "register_together",
+    "surface",
 ]
 _MODULES = {
     "amers.app.client": ("Client", "ServiceError"),
@@ -72,6 +74,7 @@ _MODULES = {
         "register",
         "register_on_reference",
         "register_together",
+        "surface",
     ),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}

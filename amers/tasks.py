@@ -1,4 +1,4 @@
-"""The tasks of the library: refine, register, produce points, orthorectify, correct vectors.
+"""The tasks of the library: refine, register, produce points, orthorectify, surfaces, vectors.
 
 Each calls the use case that the command line and the service call; those have more options.
 """
@@ -32,6 +32,14 @@ from amers.app.usecases.registration.together import (
     JointPlace,
     run_joint_registration,
 )
+from amers.app.usecases.surface import (
+    SurfaceFile,
+    SurfaceFiles,
+    check_images,
+    run_surface,
+    scene_of_file,
+    write_surface,
+)
 from amers.app.usecases.terrain_file import TerrainFile
 from amers.app.usecases.vector_files import CorrectionOptions, VectorFile
 from amers.app.usecases.vectors import CorrectedFile, correct_file
@@ -57,6 +65,7 @@ from amers.services.quality.qualification import QualificationOptions
 from amers.services.registration.on_points import Registration, register_scene
 from amers.services.registration.options import RegistrationOptions
 from amers.services.reports.joint import JointReport
+from amers.services.surface.options import SurfaceOptions
 from amers.services.types import Progress, no_progress
 
 
@@ -346,6 +355,51 @@ def orthorectify(
         options=OrthoOptions(hide=hide),
         progress=progress,
     )
+
+
+def surface(
+    scenes: Sequence[Scene | FilePath],
+    output: FilePath,
+    *,
+    registered: FilePath | None = None,
+    gsd_m: float | None = None,
+    heights_m: tuple[float, float] | None = None,
+    pairs: int = 10,
+    jobs: int = 1,
+    progress: Progress = no_progress,
+) -> SurfaceFile:
+    """Write the surface that overlapping scenes show: heights on a map, with their accuracy.
+
+    The bands are the height above the ellipsoid and its standard deviation in metres, the number of
+    images, and a number for the reason why a cell has no height. An interrupted surface goes on from
+    where it was.
+
+    Args:
+        scenes: two or more, whose models agree: scenes or their paths.
+        output: path of the GeoTIFF; an existing file is replaced.
+        registered: folder of the results of `register_together`, whose models are used. By default
+            those of the scenes, such as scenes opened with the adjusted models of a block.
+        gsd_m: side of a cell, metres. By default the ground sampling of the finest scene.
+        heights_m: lowest and highest surface above the ellipsoid, metres. By default the heights that
+            the models are meant for; a narrower range is faster.
+        pairs: largest number of pairs of scenes that show a place. By default 10.
+        jobs: processes at once. By default 1: this process.
+        progress: receives the fraction done and a message. By default nothing does.
+
+    Raises:
+        InputError: a scene cannot be used.
+        CoverageError: the scenes do not show the same ground, or nothing of it was matched.
+    """
+    images, file = tuple(_files_of(scene).image for scene in scenes), Path(output)
+    options, place = SurfaceOptions(gsd_m, heights_m, pairs), WorkPlace(compute=ComputeOptions(jobs))
+    if registered is not None:
+        files = SurfaceFiles(images, Path(registered))
+        return run_surface(files, file, options, place=place, progress=progress)
+    check_images(images, file)
+    with ExitStack() as stack:
+        opened = [s if isinstance(s, Scene) else stack.enter_context(as_scene(s)) for s in scenes]
+        named = [scene_of_file(one.content, image) for one, image in zip(opened, images, strict=True)]
+        return write_surface(named, file, options, place=place, progress=progress)
 
 
 def correct_vectors(

@@ -17,6 +17,7 @@ from amers.services.matching.tie_points import MatchOptions
 from amers.services.orthorectification.rectify import OrthoOptions
 from amers.services.production.image_production import ProductionOptions
 from amers.services.registration.options import RegistrationOptions
+from amers.services.surface.options import SurfaceOptions
 from scripts.recipes import LIBRARY, recipes, write_files, write_modules_of_others
 from tests.app.flat_world import CENTRE, GROUND_H, SHIFT_PX, FlatWorld, make_flat_world
 from tests.imports import beyond_budget, imported_by
@@ -35,6 +36,7 @@ TASKS = (
     "register",
     "register_on_reference",
     "register_together",
+    "surface",
 )
 OPTION = re.compile(r"^ {8}(\w+(?:, \w+)*): (.*?)(?=^ {8}\w+(?:, \w+)*: |\Z)", re.DOTALL | re.MULTILINE)
 """The line of an option in a docstring, with what follows."""
@@ -131,6 +133,7 @@ def test_defaults_are_those_of_the_science():
     assert default("match_images", "max_ratio") == MatchOptions().max_ratio
     assert default("match_images", "tolerance_px") == MatchOptions().tolerance_px
     assert default("orthorectify", "hide") == OrthoOptions().hide
+    assert default("surface", "pairs") == SurfaceOptions().pairs
     assert default("correct_vectors", "sigma_px") == CorrectionOptions().sigma_px
     assert default("correct_vectors", "pixels") == CorrectionOptions().pixels
 
@@ -239,7 +242,7 @@ def test_scenes_of_one_name_are_refused_before_any_work():
 
 
 def test_there_are_twelve_recipes_of_some_ten_lines():
-    assert len(RECIPES) == 12 + len(["Errors"])
+    assert len(RECIPES) == 13 + len(["Errors"])
     assert [name for name, program in RECIPES.items() if len(program.splitlines()) > 10] == []
 
 

@@ -128,16 +128,23 @@ def run_surface(
         InputError: a file cannot be used.
         CoverageError: the scenes do not show the same ground, or nothing of it was matched.
     """
-    if len(files.images) < 2:
-        raise InputError(
-            f"{len(files.images)} image found; a surface needs two or more of the same ground"
-        )
-    if output.resolve() in [path.resolve() for path in files.images]:
-        raise InputError(f"{output}: the output would replace an image; choose another name")
+    check_images(files.images, output)
     with ExitStack() as stack:
         scenes = [_scene(image, files, stack) for image in files.images]
         named = [scene_of_file(scene, image) for scene, image in zip(scenes, files.images, strict=True)]
         return write_surface(named, output, options, place=place, progress=progress)
+
+
+def check_images(images: Sequence[Path], output: Path) -> None:
+    """Refuse fewer than two images, and an output that would replace one.
+
+    Raises:
+        InputError: the message says which.
+    """
+    if len(images) < 2:
+        raise InputError(f"{len(images)} image found; a surface needs two or more of the same ground")
+    if output.resolve() in [path.resolve() for path in images]:
+        raise InputError(f"{output}: the output would replace an image; choose another name")
 
 
 def write_surface(
