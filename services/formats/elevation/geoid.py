@@ -3,6 +3,7 @@
 import os
 import re
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +56,7 @@ def geoid_of_grid(path: Path) -> Geoid:
         )
     except ProjError as error:
         raise VerticalDatumError(f"{path}: PROJ cannot read a geoid from this file: {error}") from error
-    geoid = _geoid(transformer)
+    geoid = _TransformedGeoid(transformer)
     axes = np.meshgrid(np.arange(-179.5, 180.0, 1.0), np.arange(-89.5, 90.0, 1.0))
     heights = geoid(np.column_stack([axis.ravel() for axis in axes]))
     if np.isnan(heights).all() or np.nanmax(np.abs(heights)) > _MAX_GEOID_M:
@@ -80,7 +81,7 @@ def geoid_of_crs(vertical: CRS, place: Array) -> Geoid:
     area = area_of(place)
     group = transformations(compound, area)
     if group.transformers:
-        return _geoid(group.transformers[0])
+        return _TransformedGeoid(group.transformers[0])
     wanted = [GRIDS[name] for name, code in NAMED.items() if vertical == CRS(code) and name in GRIDS]
     for grid in [grid for names in wanted for grid in names]:
         if found_grid(grid) is not None:
@@ -164,10 +165,13 @@ def vertical_crs(name: str) -> CRS | None:
     return crs
 
 
-def _geoid(transformer: Transformer) -> Geoid:
-    def height_m(lon_lat: Array) -> Array:
-        zero = np.zeros(len(lon_lat))
-        above = np.asarray(transformer.transform(lon_lat[:, 0], lon_lat[:, 1], zero)[2])
-        return np.where(np.isfinite(above), above, np.nan)
+@dataclass(frozen=True)
+class _TransformedGeoid:
+    """A geoid that PROJ transforms; other processes can have it too."""
 
-    return height_m
+    transformer: Transformer
+
+    def __call__(self, lon_lat: Array) -> Array:
+        zero = np.zeros(len(lon_lat))
+        above = np.asarray(self.transformer.transform(lon_lat[:, 0], lon_lat[:, 1], zero)[2])
+        return np.where(np.isfinite(above), above, np.nan)
