@@ -88,8 +88,17 @@ def choose_grid(
         InputError: the reference system is not known, the scene is outside the map, or the map would be
             too large.
     """
-    if crs is not None:
-        check_map_code(crs)
+    return grid_over_ground(seen_ground(scene, terrain), crs, gsd_m or scene_gsd_m(scene))
+
+
+def seen_ground(scene: Scene, terrain: Terrain) -> Array:
+    """Longitudes and latitudes (n, 2) of ground that an image shows, at its lowest and highest terrain.
+
+    Longitudes are continuous: they may exceed 180 degrees.
+
+    Raises:
+        CoverageError: the terrain does not reach the scene.
+    """
     positions = _grid_over(scene.image.shape)
     low, high = scene.model.height_range_m
     around = terrain.around(_located(scene.model, positions, (low, high)))
@@ -98,6 +107,18 @@ def choose_grid(
     if not len(lon_lat):
         raise unseen(scene, around)
     lon_lat[:, 0] = lon_lat[0, 0] + (lon_lat[:, 0] - lon_lat[0, 0] + 180.0) % 360.0 - 180.0
+    return lon_lat
+
+
+def grid_over_ground(lon_lat: Array, crs: str | None, gsd_m: float) -> MapGrid:
+    """The north-up map over positions (n, 2), whose longitudes are continuous; see `choose_grid`.
+
+    Raises:
+        InputError: the reference system is not known, the ground is outside the map, or the map would be
+            too large.
+    """
+    if crs is not None:
+        check_map_code(crs)
     lon, lat = lon_lat.mean(axis=0)
     crs = crs or utm_of((lon + 180.0) % 360.0 - 180.0, lat)
     xy = continuous_xy(crs, lon_lat)
@@ -108,7 +129,7 @@ def choose_grid(
             "system. Choose another one"
         )
     per_metre = map_units_per_metre(crs, np.array([lon, lat]))
-    step = (gsd_m or scene_gsd_m(scene)) * per_metre
+    step = gsd_m * per_metre
     first, last = np.floor(xy.min(axis=0) / step), np.ceil(xy.max(axis=0) / step)
     samples, lines = (int(count) for count in last - first)
     if lines * samples > _MAX_MAP_PIXELS:
@@ -163,6 +184,7 @@ def orthorectify(
     grid: MapGrid,
     options: OrthoOptions = OrthoOptions(),
     *,
+    part: Window | None = None,
     progress: Progress = no_progress,
 ) -> Iterator[OrthoWindow]:
     """The windows of an ortho-image, row by row; memory does not grow with image, terrain or map.
@@ -176,6 +198,8 @@ def orthorectify(
         terrain: the ground.
         grid: the map.
         options: kernel, tolerance, occlusion and size of the windows.
+        part: of the map, made as in the whole where it begins at a multiple of the size of the windows;
+            by default all of it.
         progress: receives the fraction of the rows done.
 
     Raises:
@@ -183,13 +207,14 @@ def orthorectify(
     """
     terrain = terrain.seamless(grid.lon_lat(_grid_over(grid.shape)))
     task = _Task(images, model, terrain, grid, options, _ratio(model, grid, images[0].shape))
-    lines, samples = grid.shape
+    part = part or Window(0, 0, *grid.shape)
+    end_line, end_sample = part.line + part.lines, part.sample + part.samples
     side = options.window_px
-    for line in range(0, lines, side):
-        for sample in range(0, samples, side):
-            window = Window(line, sample, min(side, lines - line), min(side, samples - sample))
+    for line in range(part.line, end_line, side):
+        for sample in range(part.sample, end_sample, side):
+            window = Window(line, sample, min(side, end_line - line), min(side, end_sample - sample))
             yield _rectified(task, window)
-        progress(min(line + side, lines) / lines, "rectifying")
+        progress(min(line + side - part.line, part.lines) / part.lines, "rectifying")
 
 
 def _rectified(task: _Task, window: Window) -> OrthoWindow:
