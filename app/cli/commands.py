@@ -91,6 +91,10 @@ COMMANDS: Tree = {
                 "scene_ortho:ortho",
                 "Orthorectify a scene through its model and a terrain into a cloud-optimised GeoTIFF.",
             ),
+            "mosaic": Command(
+                "scene_mosaic:mosaic",
+                "Make an ortho-image of scenes, cut where they agree best; measure the steps at seams.",
+            ),
         },
     ),
     "surface": Group(

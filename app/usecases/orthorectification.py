@@ -236,7 +236,7 @@ def run_orthorectification(
     ground = read_terrain(terrain)
     bands = [raster.with_mix(one_band(band)) for band in raster.validity.image_bands]
     grid = choose_grid(scene, ground, ortho_map.crs, ortho_map.gsd_m)
-    dtype, nodata = _pixel_type(raster)
+    dtype, nodata = pixel_type(raster)
     if limits is not None:
         limits.check([scene], grid, len(bands) * np.dtype(dtype).itemsize)
     counter = _DataPixels(partial(unseen, scene, ground))
@@ -269,7 +269,7 @@ def _check_request(ortho_map: OrthoMap, output: Path, inputs: Sequence[Path]) ->
         raise InputError(f"{output}: the output would replace an input file; choose another name")
 
 
-def _pixel_type(raster: SceneImage) -> tuple[str, float]:
+def pixel_type(raster: SceneImage) -> tuple[str, float]:
     """The pixel type of the ortho-image of a scene, and its value for pixels without data."""
     dtype = raster.dataset.dtypes[0]
     if dtype not in _KEPT_TYPES:

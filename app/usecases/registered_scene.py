@@ -6,6 +6,7 @@ from pathlib import Path
 
 from amers.app.errors import InputError
 from amers.app.usecases.model_choice import parse_crop_origin
+from amers.services.formats.block.reader import block_member, read_document
 from amers.services.formats.images.scenes import read_scene
 from amers.services.formats.sensor_models.correction_json import parse_correction_accuracy
 from amers.services.formats.sensor_models.refined_model import CORRECTION_JSON
@@ -80,6 +81,20 @@ def read_raw_scene(files: SceneModel) -> tuple[Scene, CorrectionAccuracy | None]
             "on an ortho-image are on the map already"
         )
     return scene, accuracy
+
+
+def adjusted_model(block: Path, image: Path) -> Path:
+    """The file of the adjusted model of an image of a block.
+
+    Raises:
+        InputError: the block has no such image, or no model of it.
+    """
+    document = read_document(block)
+    for one, model in zip(document.images, document.models, strict=True):
+        if one.image_id in (image.stem, image.name) and model is not None:
+            return block_member(block, model)
+    known = ", ".join(one.image_id for one in document.images[:5])
+    raise InputError(f"{image}: no image of {block} with an adjusted model; its images: {known}")
 
 
 def _read_accuracy(folder: Path) -> CorrectionAccuracy:

@@ -16,8 +16,7 @@ from pyproj import CRS
 from amers.app.errors import InputError
 from amers.app.usecases.executors import open_executor
 from amers.app.usecases.image_production import WorkPlace
-from amers.app.usecases.registered_scene import SceneModel, read_registered_scene
-from amers.services.formats.block.reader import block_member, read_document
+from amers.app.usecases.registered_scene import SceneModel, adjusted_model, read_registered_scene
 from amers.services.formats.images.ortho import BandForm, write_cog
 from amers.services.formats.images.scenes import read_scene
 from amers.services.formats.work_folder import WorkFolder
@@ -259,7 +258,7 @@ def _scene(image: Path, files: SurfaceFiles, stack: ExitStack) -> Scene:
         registration = files.registered / image.stem
         scene, _ = read_registered_scene(SceneModel(image, registration=registration))
     elif files.block is not None:
-        scene = read_scene(image, _adjusted_model(files.block, image), sigma_m=1.0)
+        scene = read_scene(image, adjusted_model(files.block, image), sigma_m=1.0)
     else:
         scene = read_scene(image, sigma_m=1.0)
     stack.callback(scene.image.close)  # type: ignore[attr-defined]
@@ -279,16 +278,6 @@ def refuse_ortho_image(scene: Scene, image: str) -> None:
             f"{image}: an ortho-image on a map found, which has no parallax; an image with a sensor "
             "model is expected"
         )
-
-
-def _adjusted_model(block: Path, image: Path) -> Path:
-    """The file of the adjusted model of an image of a block."""
-    document = read_document(block)
-    for one, model in zip(document.images, document.models, strict=True):
-        if one.image_id in (image.stem, image.name) and model is not None:
-            return block_member(block, model)
-    known = ", ".join(one.image_id for one in document.images[:5])
-    raise InputError(f"{image}: no image of {block} with an adjusted model; its images: {known}")
 
 
 def scene_of_file(scene: Scene, image: Path) -> SurfaceScene:

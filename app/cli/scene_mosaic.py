@@ -1,0 +1,134 @@
+"""`amers scene mosaic`: many scenes as one ortho-image, with the seams between them."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import typer
+
+from amers.app.cli.box_option import box_of
+from amers.app.cli.image_production import WorkOptions
+from amers.app.cli.options import Shown
+from amers.app.cli.output import AsJson, show_one
+from amers.app.cli.production_rows import effort_row
+from amers.app.cli.progress import shown_progress
+from amers.app.cli.terrain_options import TerrainOptions
+from amers.app.errors import InputError
+from amers.app.usecases.executors import ComputeOptions
+from amers.app.usecases.image_production import WorkPlace
+from amers.app.usecases.mosaic import MosaicGround, run_mosaic, step_words
+from amers.app.usecases.mosaic_scenes import MosaicFiles
+from amers.services.mosaic.layout import MosaicMap
+from amers.services.mosaic.options import MosaicOptions
+from amers.services.orthorectification.rectify import OrthoOptions
+from amers.services.types import Array
+
+Files = Annotated[MosaicFiles, Shown(images=typer.Argument(exists=True), registered=None, block=None)]
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """The map of a mosaic.
+
+    Attributes:
+        crs: reference system of the map; by default the UTM zone of the middle of all scenes.
+        gsd_m: ground sampling, metres; by default that of the finest scene.
+        bbox: only this ground, W,S,E,N in degrees; scenes outside it are left out.
+    """
+
+    crs: str | None = None
+    gsd_m: Annotated[float | None, typer.Option(min=0.001)] = None
+    bbox: str | None = None
+
+    def wanted(self) -> MosaicMap:
+        """The same as the service takes it.
+
+        Raises:
+            InputError: the box cannot be used.
+        """
+        return MosaicMap(self.crs, self.gsd_m, None if self.bbox is None else _outline(self.bbox))
+
+
+@dataclass(frozen=True)
+class MadeOptions:
+    """How the mosaic is made.
+
+    Attributes:
+        height_m: height of flat ground above the ellipsoid, metres; replaces --dem.
+        level: change the grey values of the scenes so that they agree where they overlap.
+        anchor: name of the scene whose grey values stay with --level; by default the mean of all stays.
+        feather_px: width of the strip along a seam in which both scenes are blended, pixels.
+        hide: leave out ground that other ground hides from a scene; other scenes fill it.
+        kernel: interpolation: cubic or bilinear.
+    """
+
+    height_m: float | None = None
+    level: bool = False
+    anchor: str | None = None
+    feather_px: Annotated[float, typer.Option(min=0.0, max=512.0)] = 0.0
+    hide: bool = False
+    kernel: str = "cubic"
+
+    def options(self) -> MosaicOptions:
+        """The same as the service takes it.
+
+        Raises:
+            InputError: the kernel is not known, or an anchor has nothing to do.
+        """
+        if self.kernel not in ("cubic", "bilinear"):
+            raise InputError(f"--kernel: {self.kernel} found, cubic or bilinear expected")
+        if self.anchor is not None and not self.level:
+            raise InputError(f"--anchor: {self.anchor} found without --level, which it belongs to")
+        kernel: Literal["cubic", "bilinear"] = "cubic" if self.kernel == "cubic" else "bilinear"
+        ortho = OrthoOptions(kernel=kernel, hide=self.hide)
+        return MosaicOptions(self.level, self.anchor, self.feather_px, ortho)
+
+
+def mosaic(
+    *,
+    files: Files,
+    output: Annotated[Path, typer.Option("-o", "--output", help="GeoTIFF to write.")],
+    ground: TerrainOptions,
+    mosaic_map: MapOptions,
+    made: MadeOptions,
+    place: WorkOptions,
+    as_json: AsJson = False,
+) -> None:
+    """Make an ortho-image of scenes, cut where they agree best; measure the steps at seams.
+
+    Writes a cloud-optimised GeoTIFF; NAME.sources.tif, the number of the scene of each pixel; and
+    NAME.seams.gpkg, the ground that each scene shows. With --registered or --block, the steps are also
+    measured with the delivered models.
+    """
+    with shown_progress() as progress:
+        written = run_mosaic(
+            files,
+            MosaicGround(ground.terrain, made.height_m),
+            output,
+            made.options(),
+            wanted=mosaic_map.wanted(),
+            place=WorkPlace(place.work, ComputeOptions(place.jobs, place.cluster)),
+            progress=progress,
+        )
+    record = asdict(written)
+    record |= effort_row(written.effort, as_json=as_json)
+    if not as_json:
+        record.pop("effort")
+        step = written.seam_step
+        record["seam_step"] = "no seams" if step is None else step_words(step)
+        record["pairs"] = [f"{' + '.join(pair['scenes'])}: {step_words(pair)}" for pair in written.pairs]
+        record["scenes"] = [f"{one['scene']} {100.0 * one['share']:.1f} %" for one in written.scenes]
+    show_one(record, as_json=as_json)
+
+
+def _outline(text: str) -> Array:
+    """Continuous positions (n, 2) along the border of a box."""
+    box = box_of(text)
+    east = box.east + (360.0 if box.east < box.west else 0.0)
+    t = np.linspace(0.0, 1.0, 17)
+    along = np.column_stack([box.west + t * (east - box.west), np.full(len(t), box.south)])
+    up = np.column_stack([np.full(len(t), east), box.south + t * (box.north - box.south)])
+    back = np.column_stack([along[::-1, 0], np.full(len(t), box.north)])
+    down = np.column_stack([np.full(len(t), box.west), up[::-1, 1]])
+    return np.concatenate([along, up, back, down])

@@ -1,0 +1,194 @@
+"""Mosaics of scenes whose truth is known: steps, levels, seams, and pixels that no tile changes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from amers.services.errors import CoverageError, InputError
+from amers.services.mosaic.layout import MosaicMap, flat_terrain, lay_out
+from amers.services.mosaic.mosaic import make_mosaic
+from amers.services.mosaic.options import MosaicOptions
+from amers.services.mosaic.steps import seam_places
+from amers.services.sensors.ortho import OrthoModel
+from tests.services.mosaic.worlds import (
+    GRID,
+    GSD_M,
+    assembled,
+    cut_out,
+    layout_of,
+    mosaic_of,
+    scene,
+    truth_on,
+)
+
+a_twentieth_of_a_pixel_m = 0.05 * GSD_M
+one_percent = 0.01
+
+
+def test_a_mosaic_shows_every_pixel_of_the_ground() -> None:
+    mosaic = mosaic_of([scene(k, *cut_out(k)) for k in range(3)])
+    pixels, source = assembled(mosaic)
+    truth = truth_on(mosaic.grid)
+    assert set(np.unique(source[np.isfinite(truth[0])])) >= {1, 2, 3}
+    seen = source > 0
+    assert (np.isfinite(pixels).all(axis=0) == seen).all()
+    np.testing.assert_allclose(pixels[:, seen], truth[:, seen], atol=0.1)
+    assert seen[np.isfinite(truth[0])].mean() > 0.97  # the third scene is lower than the others
+    assert mosaic.steps is not None
+    assert mosaic.steps.used.found == mosaic.steps.places > 20
+    assert mosaic.steps.used.p90_m < a_twentieth_of_a_pixel_m
+    assert mosaic.steps.delivered is None
+
+
+@pytest.mark.parametrize("off_px", [(3.0, -7.0), (0.4, 0.25), (-18.0, 12.0)])
+def test_a_known_shift_of_a_scene_is_the_step_at_its_seams(off_px: tuple[float, float]) -> None:
+    """The second scene has a model off by a shift, and the right one as that before registration."""
+    first, second = scene(0, *cut_out(0)), scene(1, *cut_out(1, off_px=off_px))
+    right = OrthoModel(cut_out(1)[1])
+    mosaic = mosaic_of([replace(first, delivered=first.scene.model), replace(second, delivered=right)])
+    steps = mosaic.steps
+    assert steps is not None
+    assert steps.delivered is not None
+    assert steps.used.found > 0.8 * steps.places
+    expected = np.array([off_px[1], -off_px[0]]) * GSD_M
+    found = np.array([steps.used.east_m, steps.used.north_m])
+    np.testing.assert_allclose(found, expected, atol=a_twentieth_of_a_pixel_m)
+    assert steps.used.median_m == pytest.approx(np.hypot(*expected), abs=a_twentieth_of_a_pixel_m)
+    assert steps.delivered.p90_m < a_twentieth_of_a_pixel_m
+    assert mosaic.pair_steps[0].scenes == ("scene_0", "scene_1")
+
+
+GAINS = ((1.0, 0.0), (1.3, -80.0), (0.7, 150.0))
+
+
+@pytest.mark.parametrize("anchor", [None, "scene_1"])
+def test_known_gains_are_levelled_to_a_percent(anchor: str | None) -> None:
+    """A tenth of the second scene is a cloud, and each has its own noise."""
+    rng = np.random.default_rng(1)
+    scenes = []
+    for number, (gain, offset) in enumerate(GAINS):
+        pixels, grid = cut_out(number, gain=gain, offset=offset)
+        pixels += rng.normal(scale=10.0, size=pixels.shape).astype(np.float32)
+        if number == 1:
+            pixels[:, 100:300, :130] = 1500.0
+        scenes.append(scene(number, pixels, grid))
+    mosaic = mosaic_of(scenes, level=True, anchor=anchor)
+    to_truth = np.array([[1.0 / gain, -offset / gain] for gain, offset in GAINS])
+    for band in range(2):
+        gain, offset = mosaic.levels.gain[:, band], mosaic.levels.offset[:, band]
+        together = gain / to_truth[:, 0]
+        assert together == pytest.approx(np.full(3, together[0]), rel=one_percent)
+        of_500 = gain * (500.0 * np.array([g for g, _ in GAINS]) + [o for _, o in GAINS]) + offset
+        assert of_500 == pytest.approx(np.full(3, of_500[0]), rel=one_percent)
+        if anchor is not None:
+            assert gain[1] == 1.0
+            assert offset[1] == 0.0
+    # Without --level, grey values stay.
+    assert (mosaic_of(scenes).levels.gain == 1.0).all()
+
+
+def test_no_seam_crosses_a_cloud_or_what_has_moved() -> None:
+    first, grid = cut_out(0)
+    second, other = cut_out(1)
+    first, second = first.copy(), second.copy()
+    first[:, 250:330, 380:460] = 1400.0  # a cloud in the middle of the overlap
+    second[:, 450:470, 30:90] = 150.0  # a lorry
+    mosaic = mosaic_of([scene(0, first, grid), scene(1, second, other)])
+    _, source = assembled(mosaic)
+    line, sample = np.round(mosaic.grid.line_sample_of_xy(GRID.origin_xy[None, :])[0]).astype(int)
+    for rows, columns in ((slice(250, 330), slice(380, 460)), (slice(450, 470), slice(380, 440))):
+        shown = source[
+            rows.start + line : rows.stop + line, columns.start + sample : columns.stop + sample
+        ]
+        assert len(np.unique(shown)) == 1
+    assert {1, 2} <= set(np.unique(source))
+
+
+@pytest.mark.parametrize("options", [{}, {"level": True, "feather_px": 10.0}])
+def test_tiles_of_any_size_give_the_same_pixels(options: dict[str, object]) -> None:
+    scenes = [scene(k, *cut_out(k, gain=1.0 + 0.1 * k, off_px=(0.3 * k, 0.0))) for k in range(3)]
+    whole = assembled(mosaic_of(scenes, tile_px=2048, **options))
+    small = assembled(mosaic_of(scenes, tile_px=512, **options))
+    again = assembled(mosaic_of(scenes, tile_px=512, **options))
+    for a, b, c in zip(whole, small, again, strict=True):
+        assert a.tobytes() == b.tobytes() == c.tobytes()
+
+
+def test_a_feathered_seam_has_no_step_of_grey_values() -> None:
+    scenes = [scene(0, *cut_out(0)), scene(1, *cut_out(1, offset=200.0))]
+    sharp, source = assembled(mosaic_of(scenes))
+    soft, _ = assembled(mosaic_of(scenes, feather_px=20.0))
+    truth = truth_on(mosaic_of(scenes).grid)
+    excess = soft - truth
+    inside = np.isfinite(excess[0]) & (source > 0)
+    assert np.nanmin(excess[:, inside]) > -0.2
+    assert np.nanmax(excess[:, inside]) < 200.2
+    blended = (excess[0] > 5.0) & (excess[0] < 195.0)
+    width = blended.sum(axis=1)[100:-100]
+    assert 10 < np.median(width) < 30
+    assert not ((sharp - truth)[0][inside] > 5.0)[((sharp - truth)[0][inside] < 195.0)].any()
+
+
+def test_gaps_are_filled_from_other_scenes() -> None:
+    pixels, grid = cut_out(0)
+    pixels = pixels.copy()
+    pixels[:, 300, 420] = np.nan
+    pixels[:, 200:260, 100:130] = np.nan  # ground that the second scene does not show
+    mosaic = mosaic_of([scene(0, pixels, grid), scene(1, *cut_out(1))])
+    found, source = assembled(mosaic)
+    truth = truth_on(mosaic.grid)
+    line, sample = np.round(mosaic.grid.line_sample_of_xy(GRID.origin_xy[None, :])[0]).astype(int)
+    assert source[300 + line, 420 + sample] == 2
+    assert np.isfinite(found[:, 300 + line, 420 + sample]).all()
+    hole = source[205 + line : 255 + line, 105 + sample : 125 + sample]
+    assert (hole == 0).all()
+    seen = source > 0
+    np.testing.assert_allclose(found[:, seen], truth[:, seen], atol=0.5)
+
+
+def test_a_scene_within_another_adds_no_seam() -> None:
+    pixels, grid = cut_out(0)
+    inner = replace(grid, origin_xy=grid.xy(np.array([[100.0, 100.0]]))[0], shape=(300, 300))
+    scenes = [scene(0, pixels, grid), scene(1, pixels[:, 100:400, 100:400], inner)]
+    mosaic = mosaic_of(scenes)
+    assert mosaic.steps is None
+    assert (assembled(mosaic)[1] <= 1).all()
+
+
+def test_scenes_outside_the_box_are_left_out_by_name() -> None:
+    scenes = [scene(k, *cut_out(k)) for k in range(3)]
+    corners = np.array([[100.0, 20.0], [100.0, 200.0], [300.0, 200.0], [300.0, 20.0]])
+    wanted = MosaicMap(GRID.crs, GSD_M, GRID.lon_lat(corners))
+    layout = lay_out(scenes, flat_terrain(0.0), wanted)
+    assert layout.left_out == ("scene_1", "scene_2")
+    assert layout.grid.shape == pytest.approx((200, 180), abs=3)
+    whole, _ = assembled(mosaic_of(scenes[:1]))
+    part, _ = assembled(make_mosaic(layout, flat_terrain(0.0)))
+    line, sample = np.round(
+        layout_of(scenes[:1]).grid.line_sample_of_xy(layout.grid.origin_xy[None, :])[0]
+    ).astype(int)
+    lines, samples = layout.grid.shape
+    np.testing.assert_allclose(part, whole[:, line : line + lines, sample : sample + samples], atol=0.05)
+    far = MosaicMap(GRID.crs, GSD_M, GRID.lon_lat(corners + [0.0, 50_000.0]))
+    with pytest.raises(CoverageError, match="check --bbox"):
+        lay_out(scenes, flat_terrain(0.0), far)
+
+
+def test_other_bands_and_unknown_anchors_are_refused() -> None:
+    pixels, grid = cut_out(0)
+    with pytest.raises(InputError, match="scene_1: 1 bands found, 2 expected as in scene_0"):
+        mosaic_of([scene(0, pixels, grid), scene(1, pixels[:1], grid)])
+    with pytest.raises(InputError, match="anchor: nobody found"):
+        mosaic_of([scene(0, pixels, grid)], level=True, anchor="nobody")
+    with pytest.raises(InputError, match="a multiple of 512"):
+        MosaicOptions(tile_px=500)
+
+
+def test_places_lie_on_seams_only() -> None:
+    labels = np.zeros((40, 40), dtype=np.int16)
+    labels[5:35, 5:20], labels[5:35, 20:35] = 1, 2
+    places = seam_places(labels, 4)
+    assert list(places) == [(0, 1)]
+    assert (np.abs(places[0, 1][:, 1] - 80) <= 4).all()
+    assert seam_places(labels * 0, 4) == {}
