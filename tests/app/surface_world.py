@@ -29,14 +29,17 @@ def model_of(look: str) -> RpcModel:
 
 def write_pair(folder: Path, off_px: tuple[float, float] = (0.0, 0.0)) -> tuple[Path, ...]:
     """Write both views with their RPCs, the second of which is off by some pixels."""
-    paths = []
-    for look, off in zip(LOOKS, ((0.0, 0.0), off_px), strict=True):
-        image = scene(look).image
-        pixels = image.read(Window(0, 0, *image.shape)).astype(np.uint16)
-        model = model_of(look)
-        paths.append(folder / f"{look}.tif")
-        write_raster(paths[-1], pixels, replace(model, image_offset=model.image_offset + off))
-    return tuple(paths)
+    return tuple(
+        write_view(folder, look, off) for look, off in zip(LOOKS, ((0.0, 0.0), off_px), strict=True)
+    )
+
+
+def write_view(folder: Path, look: str, off_px: tuple[float, float] = (0.0, 0.0)) -> Path:
+    """Write a view with its RPC, which is off by some pixels."""
+    image, model, path = scene(look).image, model_of(look), folder / f"{look}.tif"
+    pixels = image.read(Window(0, 0, *image.shape)).astype(np.uint16)
+    write_raster(path, pixels, replace(model, image_offset=model.image_offset + off_px))
+    return path
 
 
 def write_registrations(images: tuple[Path, ...], folder: Path) -> Path:

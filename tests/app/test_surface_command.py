@@ -1,6 +1,8 @@
 """`amers surface make` on files: what it writes, how it goes on, and what it says of bad inputs."""
 
 import json
+import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,31 +15,28 @@ from amers.app.usecases.executors import ComputeOptions
 from amers.app.usecases.image_production import WorkPlace
 from amers.app.usecases.surface import BANDS, SurfaceFile, SurfaceFiles, run_surface
 from amers.services.errors import AmersError
+from amers.services.formats.block.writer import write_block
 from amers.services.formats.elevation.dem import read_dem
-from amers.services.formats.images.raster import write_raster
-from amers.services.imagery.source import Window
-from amers.services.sensors.rpc import RpcModel
 from amers.services.surface import surface as surface_module
-from amers.services.surface.options import SurfaceOptions
+from tests.app.surface_world import LOOKS, OFF_PX, OPTIONS, model_of, write_pair, write_registrations
 from tests.command_line import amers_here
-from tests.services.surface.worlds import scene, town
+from tests.factories import BOX, control_points, metadata, noise_chips
+from tests.factories import images as images_of
+from tests.services.surface.worlds import town
 
-OPTIONS = SurfaceOptions(gsd_m=0.5, heights_m=(140.0, 180.0))
+OPEN_GROUND = town().centre_lon_lat[None, :] + [[0.0, -0.0004]]
 
 
 @pytest.fixture(scope="module")
 def images(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ...]:
     """A pair as files with their RPCs."""
-    folder = tmp_path_factory.mktemp("pair")
-    paths = []
-    for look in ("left", "right"):
-        one = scene(look)
-        assert isinstance(one.model, RpcModel)
-        lines, samples = one.image.shape
-        pixels = one.image.read(Window(0, 0, lines, samples)).astype(np.uint16)
-        paths.append(folder / f"{look}.tif")
-        write_raster(paths[-1], pixels, one.model)
-    return tuple(paths)
+    return write_pair(tmp_path_factory.mktemp("pair"))
+
+
+@pytest.fixture(scope="module")
+def images_off(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ...]:
+    """The same with models that do not agree."""
+    return write_pair(tmp_path_factory.mktemp("off"), OFF_PX)
 
 
 def made(images: tuple[Path, ...], output: Path, jobs: int = 1) -> SurfaceFile:
@@ -56,8 +55,7 @@ def test_the_file_has_heights_above_the_ellipsoid(images: tuple[Path, ...], tmp_
         assert file.shape == (surface.lines, surface.samples)
     terrain = read_dem(output)
     assert terrain.geoid is None
-    lon_lat = town().centre_lon_lat[None, :] + [[0.0, -0.0004]]
-    assert terrain.height_m(lon_lat) == pytest.approx(town().height_m(lon_lat), abs=0.3)
+    assert terrain.height_m(OPEN_GROUND) == pytest.approx(town().height_m(OPEN_GROUND), abs=0.3)
 
 
 def test_work_that_was_stopped_goes_on_to_the_same_bytes(
@@ -80,14 +78,6 @@ def test_work_that_was_stopped_goes_on_to_the_same_bytes(
     assert stopped.read_bytes() == whole.read_bytes()
 
 
-@pytest.mark.thorough
-def test_two_processes_write_the_same_bytes(images: tuple[Path, ...], tmp_path: Path) -> None:
-    one, two = tmp_path / "one.tif", tmp_path / "two.tif"
-    made(images, one)
-    made(images, two, jobs=2)
-    assert one.read_bytes() == two.read_bytes()
-
-
 def test_the_command_tells_pairs_and_cells(images: tuple[Path, ...], tmp_path: Path) -> None:
     output = tmp_path / "surface.tif"
     words = [
@@ -107,6 +97,58 @@ def test_the_command_tells_pairs_and_cells(images: tuple[Path, ...], tmp_path: P
     record = json.loads(done.stdout)
     assert record["pairs"][0]["base_to_height"] == pytest.approx(0.5, abs=0.01)
     assert record["cells"]["has a height"] > 10_000
+
+
+def centre_height_m(surface: Path) -> float:
+    """The height of a surface in the middle of the town, on open ground."""
+    return float(read_dem(surface).height_m(OPEN_GROUND)[0])
+
+
+def command(images: tuple[Path, ...], output: Path, *models: object) -> subprocess.CompletedProcess[str]:
+    words = ["surface", "make", *images, "-o", output, *models, "--gsd-m", 1, "--heights-m", "140,180"]
+    return amers_here([*words, "--json"], {"PATH": ""})
+
+
+def write_block_of_pair(folder: Path) -> Path:
+    """Write a block whose images are the pair, with their true models."""
+    points = control_points(4, np.random.default_rng(1), BOX, len(LOOKS))
+    named = tuple(replace(one, image_id=look) for one, look in zip(images_of(2), LOOKS, strict=True))
+    points = replace(points, views=replace(points.views, images=named))
+    models = {look: model_of(look) for look in LOOKS}
+    write_block(folder, metadata("town"), points, noise_chips(points), models)
+    return folder
+
+
+def test_registered_models_and_those_of_a_block_are_used(
+    images_off: tuple[Path, ...], tmp_path: Path
+) -> None:
+    registered = write_registrations(images_off, tmp_path / "registered")
+    block = write_block_of_pair(tmp_path / "block")
+    truth_m = float(town().height_m(OPEN_GROUND)[0])
+    found = {}
+    for name, models in {"registered": registered, "block": block}.items():
+        output = tmp_path / f"{name}.tif"
+        done = command(images_off, output, f"--{name}", models)
+        assert done.returncode == 0, done.stderr
+        found[name] = json.loads(done.stdout)["cells"]["has a height"]
+        assert centre_height_m(output) == pytest.approx(truth_m, abs=0.3), name
+    assert found["registered"] == pytest.approx(found["block"], rel=0.01)
+    delivered = json.loads(command(images_off, tmp_path / "off.tif").stdout)
+    assert delivered["cells"]["has a height"] < 0.7 * found["block"]
+
+
+def test_models_that_are_not_there_are_named(images: tuple[Path, ...], tmp_path: Path) -> None:
+    block = write_block_of_pair(tmp_path / "block")
+    other = tmp_path / "other.tif"
+    other.write_bytes(images[0].read_bytes())
+    done = command((images[0], other), tmp_path / "s.tif", "--block", block)
+    assert done.returncode != 0
+    assert "no image of" in done.stderr
+    assert "its images: left, right" in " ".join(done.stderr.split())
+    done = command(images, tmp_path / "s.tif", "--registered", tmp_path)
+    assert done.returncode != 0
+    assert "no correction.json found" in " ".join(done.stderr.split())
+    assert not (tmp_path / "s.tif").exists()
 
 
 @pytest.mark.parametrize(
