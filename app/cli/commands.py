@@ -105,6 +105,10 @@ COMMANDS: Tree = {
                 "Make the surface that overlapping registered scenes show: heights with their accuracy, "
                 "on a map.",
             ),
+            "points": Command(
+                "surface:points",
+                "Write the cells of a surface as a point cloud, for CloudCompare and QGIS.",
+            ),
         },
     ),
     "vectors": Group(

@@ -1,4 +1,4 @@
-"""`amers surface make`: the surface that overlapping scenes show, as heights on a map."""
+"""`amers surface`: the surface that overlapping scenes show, its points, and what changed."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,6 +15,7 @@ from amers.app.errors import InputError
 from amers.app.usecases.executors import ComputeOptions
 from amers.app.usecases.image_production import WorkPlace
 from amers.app.usecases.surface import SurfaceFiles, run_surface
+from amers.app.usecases.surface_points import write_surface_points
 from amers.services.surface.options import MOST_FILL_CELLS, SurfaceOptions
 
 Files = Annotated[SurfaceFiles, Shown(images=typer.Argument(exists=True), registered=None, block=None)]
@@ -80,6 +81,26 @@ def make(
         ]
         record["cells"] = [f"{label}: {count:,}" for label, count in surface.cells.items()]
     show_one(record, as_json=as_json)
+
+
+def points(
+    surface: Annotated[Path, typer.Argument(exists=True, help="As `amers surface make` writes it.")],
+    *,
+    output: Annotated[Path, typer.Option("-o", "--output", help="LAZ or LAS file to write.")],
+    max_sigma_m: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="Leave out cells with a larger standard deviation, metres."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write the cells of a surface as a point cloud, for CloudCompare and QGIS.
+
+    Heights are above the ellipsoid, as the reference system in the file says. Every point has its
+    standard deviation (sigma_m) and the number of images that show it (views), 0 where it was filled.
+    """
+    with shown_progress() as progress:
+        cloud = write_surface_points(surface, output, max_sigma_m=max_sigma_m, progress=progress)
+    show_one(asdict(cloud), as_json=as_json)
 
 
 def _range(text: str) -> tuple[float, float]:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pyproj import CRS
 
 from amers.app.errors import InputError
 from amers.app.usecases.executors import open_executor
@@ -19,6 +18,7 @@ from amers.app.usecases.image_production import WorkPlace
 from amers.app.usecases.registered_scene import SceneModel, adjusted_model, read_registered_scene
 from amers.services.formats.images.ortho import BandForm, write_cog
 from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.images.surfaces import BANDS, heights_crs
 from amers.services.formats.work_folder import WorkFolder
 from amers.services.imagery.scene import Scene
 from amers.services.map_grid import MapGrid
@@ -31,9 +31,6 @@ from amers.services.surface.options import SurfaceOptions
 from amers.services.surface.surface import Surface, SurfaceTile, make_surface, surface_tiles
 from amers.services.tasks import Effort, Work
 from amers.services.types import Progress, no_progress, part_of
-
-BANDS = ("height_m", "sigma_m", "views", "reason")
-"""Bands of the file of a surface."""
 
 
 @dataclass(frozen=True)
@@ -231,19 +228,6 @@ class _Cells:
         self.reasons[Reason.OUTSIDE] += n_cells - int(self.reasons.sum())
         counts = zip(Reason, self.reasons.tolist(), strict=True)
         return {REASON_LABELS[reason]: count for reason, count in counts if count}
-
-
-def heights_crs(grid: MapGrid) -> str:
-    """The reference system of a grid with heights above the ellipsoid, as WKT.
-
-    GeoTIFF cannot say this of a map; a vertical system of this name can be written, and is read again.
-    """
-    horizontal = CRS.from_user_input(grid.crs)
-    return (
-        f'COMPOUNDCRS["{horizontal.name} + ellipsoidal height",{horizontal.to_wkt("WKT2_2019")},'
-        'VERTCRS["WGS 84 ellipsoidal height",VDATUM["WGS 84 ellipsoid"],CS[vertical,1],'
-        'AXIS["up",up,LENGTHUNIT["metre",1]]]]'
-    )
 
 
 def _windows(tiles: Iterator[SurfaceTile]) -> Iterator[OrthoWindow]:

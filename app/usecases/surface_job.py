@@ -34,12 +34,12 @@ from amers.app.usecases.results import store_results
 from amers.app.usecases.scene_inputs import check_scene, present_scene, registered_model_keys
 from amers.app.usecases.scenes import local_image, stored_keys
 from amers.app.usecases.surface import (
-    BANDS,
     SurfaceScene,
     refuse_ortho_image,
     surface_inputs,
     write_surface,
 )
+from amers.services.formats.images.surfaces import BANDS
 from amers.services.surface.options import MOST_FILL_CELLS, SurfaceOptions
 from amers.services.surface.surface import surface_grid
 

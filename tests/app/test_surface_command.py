@@ -13,10 +13,11 @@ import rasterio
 from amers.app.errors import InputError
 from amers.app.usecases.executors import ComputeOptions
 from amers.app.usecases.image_production import WorkPlace
-from amers.app.usecases.surface import BANDS, SurfaceFile, SurfaceFiles, run_surface
+from amers.app.usecases.surface import SurfaceFile, SurfaceFiles, run_surface
 from amers.services.errors import AmersError
 from amers.services.formats.block.writer import write_block
 from amers.services.formats.elevation.dem import read_dem
+from amers.services.formats.images.surfaces import BANDS
 from amers.services.surface import surface as surface_module
 from tests.app.surface_world import LOOKS, OFF_PX, OPTIONS, model_of, write_pair, write_registrations
 from tests.command_line import amers_here

@@ -18,7 +18,8 @@ from amers.app.usecases.image_production import WorkPlace
 from amers.app.usecases.jobs import do_attempt
 from amers.app.usecases.processes import work_folder
 from amers.app.usecases.results import discard_work
-from amers.app.usecases.surface import BANDS, SurfaceFiles, run_surface
+from amers.app.usecases.surface import SurfaceFiles, run_surface
+from amers.services.formats.images.surfaces import BANDS
 from amers.services.surface import stages, surface
 from amers.services.types import Acquisition
 from tests.app.callers import Bearer, Caller

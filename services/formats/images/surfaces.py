@@ -1,0 +1,86 @@
+"""Files of surfaces: their bands, their reference system, and how they are read by windows."""
+
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from pyproj import CRS
+
+from amers.services.errors import FormatError
+from amers.services.formats.images.bands import one_band
+from amers.services.formats.images.raster import RasterImage, map_grid_of, open_raster
+from amers.services.imagery.source import Window
+from amers.services.map_grid import MapGrid
+from amers.services.surface.surface import SurfaceTile
+
+BANDS = ("height_m", "sigma_m", "views", "reason")
+"""Bands of the file of a surface."""
+
+
+def heights_crs(grid: MapGrid) -> str:
+    """The reference system of a grid with heights above the ellipsoid, as WKT.
+
+    GeoTIFF cannot say this of a map; a vertical system of this name can be written, and is read again.
+    """
+    horizontal = CRS.from_user_input(grid.crs)
+    return (
+        f'COMPOUNDCRS["{horizontal.name} + ellipsoidal height",{horizontal.to_wkt("WKT2_2019")},'
+        'VERTCRS["WGS 84 ellipsoidal height",VDATUM["WGS 84 ellipsoid"],CS[vertical,1],'
+        'AXIS["up",up,LENGTHUNIT["metre",1]]]]'
+    )
+
+
+@dataclass(frozen=True)
+class SurfaceImage:
+    """A surface in a file. It is read by windows, and closed as a context.
+
+    Attributes:
+        image: its first band.
+        grid: of its cells, in the horizontal reference system of the file.
+    """
+
+    image: RasterImage
+    grid: MapGrid
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.image.close()
+
+    def read(self, window: Window) -> SurfaceTile:
+        """The surface in a window of its grid."""
+        height_m, sigma_m, views, reason = (
+            self.image.with_mix(one_band(number)).read(window) for number in range(1, len(BANDS) + 1)
+        )
+        counts = (np.nan_to_num(values).astype(np.uint8) for values in (views, reason))
+        return SurfaceTile(window, height_m, sigma_m, *counts)
+
+
+def open_surface(path: Path) -> SurfaceImage:
+    """Open the file of a surface.
+
+    Raises:
+        FormatError: it is no GeoTIFF with a projected map and the bands of a surface.
+    """
+    with ExitStack() as stack:
+        image = open_raster(path)
+        stack.callback(image.close)
+        grid = map_grid_of(image)
+        if image.dataset.descriptions != BANDS or grid is None:
+            found = ", ".join(str(name) for name in image.dataset.descriptions)
+            raise FormatError(
+                f"{path}: bands {found} found, {', '.join(BANDS)} on a map expected, as `amers surface "
+                "make` writes them"
+            )
+        crs = CRS.from_user_input(grid.crs)
+        horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
+        if not horizontal.is_projected:
+            raise FormatError(f"{path}: {horizontal.name} found, a projected map in metres expected")
+        stack.pop_all()
+    return SurfaceImage(image, replace(grid, crs=horizontal.to_wkt("WKT2_2019")))
