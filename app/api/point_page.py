@@ -53,7 +53,7 @@ def _place(point: PointDetail) -> dict[str, str]:
     surface = (
         {}
         if point.surface_height_m is None
-        else {"Surface at the centre of the chips": f"{point.surface_height_m:.2f} m above WGS 84"}
+        else {"Surface at the point": f"{point.surface_height_m:.2f} m above WGS 84"}
     )
     return {
         "Latitude": f"{abs(point.lat_deg):.8f}\N{DEGREE SIGN} {north}",

@@ -77,7 +77,12 @@ class ImageOptions:
 
 Points = Annotated[
     ProductionOptions,
-    Shown(points=typer.Option(min=6), spacing_m=typer.Option(min=1.0), min_views=typer.Option(min=2)),
+    Shown(
+        points=typer.Option(min=6),
+        spacing_m=typer.Option(min=1.0),
+        min_views=typer.Option(min=2),
+        surface_pairs=typer.Option(min=0, max=100),
+    ),
 ]
 
 

@@ -41,7 +41,7 @@ class PointDetail:
 
     Attributes:
         height_m: of the content of its chips, which registration searches.
-        surface_height_m, surface_sigma_m: the surface at the centre of its chips; None where unknown.
+        surface_height_m, surface_sigma_m: the surface at its place; None where unknown.
         chip_key: key of its chips in the storage; `chip_row` is the first, `chip_count` their number.
         frame: of its block, on the Earth.
         history: how registrations fared with it.

@@ -102,7 +102,7 @@ POINTS = Collection(
         column_property(point.c.first_view, "Date of the first view"),
         column_property(point.c.last_view, "Date of the last view"),
         column_property(point.c.block_number, "Number of its block"),
-        column_property(point.c.surface_height_m, "Height of the surface at its centre", "m"),
+        column_property(point.c.surface_height_m, "Height of the surface at its place", "m"),
         column_property(point.c.surface_sigma_m, "Standard deviation of the surface height", "m"),
     ),
     geometry_type="Point",

@@ -11,7 +11,7 @@ import shapely
 
 from amers.services.imagery.scene import Scene, scene_footprint
 from amers.services.matching.multi_image import RefinementOptions, refine_on_chips
-from amers.services.production.point_views import chips_of, point_views, surface_heights
+from amers.services.production.point_views import chips_of, point_views
 from amers.services.tasks import Arrays, Work
 from amers.services.types import (
     Array,
@@ -19,7 +19,6 @@ from amers.services.types import (
     IntArray,
     Observations,
     Progress,
-    SurfaceHeights,
     Views,
 )
 
@@ -81,16 +80,14 @@ def measure_task(
 
 @dataclass(frozen=True)
 class CutPoints:
-    """Views of points, their chips, and the surface at the points.
+    """Views of points and their chips.
 
     Attributes:
         views: of the points.
-        surface: at the points.
         chips: from the row of a point to its chips, (views, 101, 101) uint16; 0 is nodata.
     """
 
     views: Views
-    surface: SurfaceHeights
     chips: Callable[[int], ChipArray]
 
 
@@ -152,16 +149,14 @@ def cut_points(
         of_part = row % _POINTS
         return np.asarray(arrays["chips"][arrays["start"][of_part] : arrays["start"][of_part + 1]])
 
-    surface = SurfaceHeights(joined("surface_height_m"), joined("surface_sigma_m"))
-    return CutPoints(views, surface, chips)
+    return CutPoints(views, chips)
 
 
 def cut_task(
     scenes: Sequence[Scene], lon_lat_h: Array, shown: Observations, gsds_m: tuple[float, float]
 ) -> Arrays:
-    """Views, chips and surface heights of the points of one part."""
+    """Views and chips of the points of one part."""
     views = point_views(scenes, shown, lon_lat_h, gsds_m)
-    surface = surface_heights(scenes, lon_lat_h, views, gsds_m[0])
     cut = chips_of(scenes, lon_lat_h, views)
     return {
         "start": views.start,
@@ -170,8 +165,6 @@ def cut_task(
         "incidence_deg": views.incidence_deg,
         "azimuth_deg": views.azimuth_deg,
         "chips": np.concatenate([cut(row) for row in range(len(lon_lat_h))]),
-        "surface_height_m": surface.height_m,
-        "surface_sigma_m": surface.sigma_m,
     }
 
 

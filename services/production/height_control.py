@@ -66,7 +66,7 @@ def surfaces_above(
     def arguments(number: int) -> tuple[Any, ...]:
         return [scenes[i] for i in images[number]], lon_lat_h[parts[number]], gsd_m
 
-    names = [f"surfaces/{number:06d}" for number in range(len(parts))]
+    names = [f"control_heights/{number:06d}" for number in range(len(parts))]
     work.run(surface_task, [(name, partial(arguments, i)) for i, name in enumerate(names)], progress)
     found = [work.kept[name] for name in names]
     return SurfaceHeights(

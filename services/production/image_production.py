@@ -25,6 +25,7 @@ from amers.services.production.control import Control, MeasuredPoints, with_cont
 from amers.services.production.ground_parts import cut_points, measure_points
 from amers.services.production.height_control import ortho_heights
 from amers.services.production.image_passes import image_passes
+from amers.services.production.point_surfaces import surfaces_at
 from amers.services.production.point_views import check_image_names, shows_chip
 from amers.services.production.tie_points import find_tie_points
 from amers.services.quality.density import GroundMask
@@ -60,6 +61,8 @@ class ProductionOptions:
         min_saliency: smallest saliency of a point's chip.
         max_sigma_m: largest horizontal standard deviation of a point within the block.
         max_sigma_up_m: largest vertical standard deviation of a point within the block.
+        surface_pairs: pairs of images at most that give the height of the surface at a point; 0 leaves
+            it unknown.
         slope: a priori standard deviation of drift and skew of an image, pixels per pixel; the block
             corrects it by what it finds.
         features, block, refinement: of the stages.
@@ -74,6 +77,7 @@ class ProductionOptions:
     min_saliency: float = 0.05
     max_sigma_m: float = 3.0
     max_sigma_up_m: float = 10.0
+    surface_pairs: int = 10
     slope: float = 1e-4
     features: FeatureOptions = field(default_factory=FeatureOptions)
     block: BlockOptions = field(default_factory=BlockOptions)
@@ -466,17 +470,16 @@ def _cut_out(
 ) -> tuple[ControlPoints, Callable[[int], ChipArray]]:
     """The chosen points as control points of one chip file, and the chips of each."""
     rows, n = chosen.rows, len(chosen.rows)
+    scenes, places, options = images.placed(adjustment), adjustment.lon_lat_h[rows], images.options
+    surface = surfaces_at(
+        scenes, places, options.surface_pairs, work=work, progress=part_of(progress, 0.0, 0.5)
+    )
     cut = cut_points(
-        images.placed(adjustment),
-        adjustment.lon_lat_h[rows],
-        chosen.shown,
-        images.options.gsds_m,
-        work=work,
-        progress=progress,
+        scenes, places, chosen.shown, options.gsds_m, work=work, progress=part_of(progress, 0.5, 0.5)
     )
     points = ControlPoints(
         id=np.arange(n, dtype=np.int64),
-        lon_lat_h=adjustment.lon_lat_h[rows],
+        lon_lat_h=places,
         covariance_m2=adjustment.point_covariance_m2[rows],
         block=np.zeros(n, dtype=np.int64),
         frames=adjustment.frames,
@@ -486,6 +489,6 @@ def _cut_out(
         chip_file=np.zeros(n, dtype=np.int64),
         chip_row=cut.views.start[:-1].copy(),
         chip_files=("chips",),
-        surface=cut.surface,
+        surface=surface,
     )
     return points, cut.chips

@@ -1,4 +1,4 @@
-"""The views of produced points: which images show them, their chips, the surface at their centres."""
+"""The views of produced points: which images show them, and their chips."""
 
 from collections.abc import Callable, Sequence
 
@@ -8,13 +8,11 @@ from amers.services.errors import InputError
 from amers.services.imagery.scene import Scene, view_direction
 from amers.services.imagery.source import render_chip
 from amers.services.matching.multi_image import chip_inside, nearly_whole, stored_chip
-from amers.services.matching.surface_heights import surface_height
 from amers.services.types import (
     Array,
     BoolArray,
     ChipArray,
     Observations,
-    SurfaceHeights,
     Views,
 )
 
@@ -131,23 +129,3 @@ def chips_of(scenes: Sequence[Scene], lon_lat_h: Array, views: Views) -> Callabl
         )
 
     return cut
-
-
-def surface_heights(
-    scenes: Sequence[Scene], lon_lat_h: Array, views: Views, gsd_m: float
-) -> SurfaceHeights:
-    """The surface at the centres of the fine chips, each in its steepest view.
-
-    Args:
-        scenes: the images of the views, with adjusted models.
-        lon_lat_h: (n, 3) the points.
-        views: of the points.
-        gsd_m: ground sampling of the fine chips, metres.
-    """
-    above_m, sigma_m = np.full(len(lon_lat_h), np.nan), np.full(len(lon_lat_h), np.nan)
-    for row, ground in enumerate(lon_lat_h):
-        of_point = np.arange(*views.start[row : row + 2])
-        of_point = of_point[views.gsd_m[of_point] == gsd_m]
-        steepest_first = views.image[of_point[np.argsort(views.incidence_deg[of_point])]]
-        above_m[row], sigma_m[row] = surface_height([scenes[i] for i in steepest_first], ground, gsd_m)
-    return SurfaceHeights(lon_lat_h[:, 2] + above_m, sigma_m)

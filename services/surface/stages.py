@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from amers.services.imagery.scene import Scene
+from amers.services.imagery.scene import Scene, scene_gsd_m
 from amers.services.map_grid import MapGrid
 from amers.services.surface.fill import filled_gaps
 from amers.services.surface.fuse import (
+    AROUND_PX,
     DISPARITY_SIGMA_PX,
     DISTANCES,
     alignment_sums,
@@ -98,14 +99,16 @@ class Stages:
         ).reshape(-1, 2)
         numbers = np.array([number for number, _ in known], dtype=np.int64)
         surfaces = [surface for _, surface in known]
-        part = part_of_grid(self.grid, tile.window, self._context)
+        part = part_of_grid(self.grid, tile.window, self._around.cells)
         pairs = PairsOfTile(numbers, images, shift_m[numbers], sigma_m[numbers], len(self.pairs))
-        return surfaces, part, pairs, self.options
+        return surfaces, part, pairs, self._around
 
     @property
-    def _context(self) -> int:
-        """Cells around a tile that filling and roughness look at."""
-        return self.options.fill_cells + 2
+    def _around(self) -> "Around":
+        """What filling and roughness look at."""
+        finest_m = min(scene_gsd_m(scene) for scene in self.scenes)
+        half = round(AROUND_PX / 2.0 * finest_m / float(self.grid.step_xy[0, 1]))
+        return Around(self.options.fill_cells, 1 + 2 * max(half, 2))
 
     def _match_arguments(self, tile: Tile, pair: Pair) -> tuple[Any, ...]:
         part = part_of_grid(self.grid, tile.window, MARGIN_CELLS)
@@ -120,6 +123,24 @@ class Stages:
         surfaces = (self._surface(tile, number) for tile in tiles if number in tile.pairs)
         known = [abs(surface.px_per_m) for surface in surfaces if surface is not None]
         return float(np.median(known)) if known else math.nan
+
+
+@dataclass(frozen=True)
+class Around:
+    """The cells that count around one.
+
+    Attributes:
+        fill_cells: gaps are filled from heights at most this many cells away.
+        rough_cells: side of the square whose roughness counts, an odd number.
+    """
+
+    fill_cells: int
+    rough_cells: int
+
+    @property
+    def cells(self) -> int:
+        """Cells around a tile that are looked at."""
+        return max(self.fill_cells, self.rough_cells // 2) + 2
 
 
 def _pair_name(tile: Tile, number: int) -> str:
@@ -155,7 +176,7 @@ class PairsOfTile:
 
 
 def align_task(
-    surfaces: Sequence[PairSurface], tile: MapGrid, pairs: PairsOfTile, options: SurfaceOptions
+    surfaces: Sequence[PairSurface], tile: MapGrid, pairs: PairsOfTile, around: Around
 ) -> Arrays:
     """What tells how the pairs lie off their fused surface on one tile; see `alignment_sums`."""
     normal, right = np.zeros((pairs.count, 3, 3)), np.zeros((pairs.count, 3))
@@ -170,13 +191,12 @@ def align_task(
 
 
 def fuse_task(
-    surfaces: Sequence[PairSurface], tile: MapGrid, pairs: PairsOfTile, options: SurfaceOptions
+    surfaces: Sequence[PairSurface], tile: MapGrid, pairs: PairsOfTile, around: Around
 ) -> Arrays:
     """The fused heights of a tile, without the cells around it that they need."""
-    context = options.fill_cells + 2
-    inside = np.s_[context:-context, context:-context]
+    inside = np.s_[around.cells : -around.cells, around.cells : -around.cells]
     if not surfaces:
-        lines, samples = (n - 2 * context for n in tile.shape)
+        lines, samples = (n - 2 * around.cells for n in tile.shape)
         unknown = np.full((lines, samples), np.nan, dtype=np.float32)
         nothing = np.zeros((lines, samples), dtype=np.uint8)
         reason = nothing + np.uint8(Reason.OUTSIDE)
@@ -189,15 +209,13 @@ def fuse_task(
         # What one pair of several sees is no more certain than what is around it.
         unsure = fused.agree < 2
         sure = np.where(unsure, np.float32(np.nan), height_m)
-        around, around_sigma_m = filled_gaps(sure, sigma_m, options.fill_cells)
-        replaced = unsure & np.isfinite(around)
-        height_m, sigma_m = (
-            np.where(replaced, around, height_m),
-            np.where(replaced, around_sigma_m, sigma_m),
-        )
+        other_m, other_sigma_m = filled_gaps(sure, sigma_m, around.fill_cells)
+        replaced = unsure & np.isfinite(other_m)
+        height_m = np.where(replaced, other_m, height_m)
+        sigma_m = np.where(replaced, other_sigma_m, sigma_m)
         fused.views[replaced] = 0
-    height_m, sigma_m = filled_gaps(height_m, sigma_m, options.fill_cells)
-    sigma_m = np.hypot(sigma_m, roughness_m(height_m))
+    height_m, sigma_m = filled_gaps(height_m, sigma_m, around.fill_cells)
+    sigma_m = np.hypot(sigma_m, roughness_m(height_m, around.rough_cells))
     reason[np.isfinite(height_m)] = Reason.FOUND
     return {
         "height_m": height_m[inside],

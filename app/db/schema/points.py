@@ -137,7 +137,7 @@ point = Table(
     # Set by an administrator: the point is not served.
     Column("suspended_at", Timestamp),
     Column("suspended_because", Text),
-    # The surface at the centre of its chips, where its block states it: both or neither.
+    # The surface at its longitude and latitude, where its block states it: both or neither.
     Column("surface_height_m", Double),
     Column("surface_sigma_m", Real),
     CheckConstraint("id >> 26 = block_number", name="id_in_block"),

@@ -95,9 +95,9 @@ def test_pairs_that_see_something_else_widen_the_sigma() -> None:
 def test_a_plane_is_not_rough() -> None:
     rows, columns = np.indices((40, 40))
     plane = (300.0 + 0.3 * rows - 0.2 * columns).astype(np.float32)
-    assert roughness_m(plane)[8:-8, 8:-8].max() < 0.02
+    assert roughness_m(plane, 9)[8:-8, 8:-8].max() < 0.02
     step = np.where(columns < 20, 0.0, 8.0).astype(np.float32)
-    assert (roughness_m(step)[10:30, 18:22] > 1.0).all()
+    assert (roughness_m(step, 9)[10:30, 18:22] > 1.0).all()
 
 
 def test_sums_tell_the_shift_of_a_pair() -> None:
