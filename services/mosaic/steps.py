@@ -26,11 +26,16 @@ _AROUND_PX = 24
 """Distance from the seam within which the chip with the most detail is taken."""
 _LOCAL_PX = 10
 """Distance from the common step of a pair within which that of a place is looked for."""
+_MUTUAL_PX = 1.0
+"""What is found is looked for in the first scene, too, and has to lie where it came from: of three dates
+of a town this left none of the places that rows of cars put 2.5 m off (benchmarks/mosaic.py)."""
+_NOWHERE = np.zeros(2, dtype=np.int64)
 _MOST_PLACES = 60
 """Places of one pair of scenes; the median of so many is known to a sixth of their spread."""
 _PLACES_IN_ALL = 6000
-_PEAK = CorrelationOptions(min_score=0.6)
-"""As for reference images: other dates, the same geometry."""
+_PEAK = CorrelationOptions(min_score=0.6, max_sigma_px=0.5)
+"""Of three dates of a town, scores of 0.5 to 0.7 gave the same median; places known to half a pixel only
+were wrong by metres as often as not (benchmarks/mosaic.py)."""
 
 
 @dataclass(frozen=True)
@@ -94,19 +99,27 @@ def seam_places(labels: Labels, cell_px: int) -> dict[tuple[int, int], IntArray]
 def steps_task(
     scenes: tuple[MosaicScene, MosaicScene], places: IntArray, rectifier: Rectifier
 ) -> Arrays:
-    """Steps (n, 2) east and north in metres at places, with the models used and those delivered.
+    """Steps (n, 2) east and north in metres around places, with the models used and those delivered.
 
-    NaN where the scenes do not correlate, or not within the search.
+    NaN where the scenes do not correlate, or not within the search. Of places that take the same chip,
+    one is kept.
     """
     metre = rectifier.grid.gsd_m
     low, high = _SEARCH_PX
     radius = min(max(math.ceil(SEARCH_M / metre), low), high)
+    chips = np.unique([_place_of_chip(scenes, place, rectifier) for place in places], axis=0)
+    out = {"used": _steps(scenes, (None, None), chips, radius, rectifier)}
     delivered = [one.delivered for one in scenes]
-    compared = any(model is not None for model in delivered)
-    out = {"used": _steps(scenes, (None, None), places, radius, rectifier)}
-    if compared:
-        out["delivered"] = _steps(scenes, delivered, places, radius, rectifier)
+    if any(model is not None for model in delivered):
+        out["delivered"] = _steps(scenes, delivered, chips, radius, rectifier)
     return {name: steps * metre for name, steps in out.items()}
+
+
+def _place_of_chip(scenes: Sequence[MosaicScene], place: IntArray, rectifier: Rectifier) -> IntArray:
+    """Middle (2,) of the chip with the most detail near a place, where both scenes have data."""
+    reach = CHIP_PX // 2 + _AROUND_PX
+    first, second = (_seen(one, None, place, reach, rectifier) for one in scenes)
+    return place + _distinct(np.where(np.isfinite(second), first, np.float32(np.nan)))
 
 
 def _steps(
@@ -116,41 +129,50 @@ def _steps(
     radius: int,
     rectifier: Rectifier,
 ) -> Array:
-    chips, patches, scores = [], [], []
-    half = CHIP_PX // 2
-    for place in places:
-        around, other = (
-            _seen(one, model, place, half + _AROUND_PX, rectifier)
-            for one, model in zip(scenes, models, strict=True)
-        )
-        off = _distinct(np.where(np.isfinite(other), around, np.float32(np.nan)))
-        top, left = (off + _AROUND_PX).tolist()
-        chips.append(np.ascontiguousarray(around[top : top + CHIP_PX, left : left + CHIP_PX]))
-        patches.append(_seen(scenes[1], models[1], place + off, half + radius, rectifier))
-        scores.append(correlation_map(patches[-1], chips[-1]))
-    known = [one for one in scores if one is not None]
+    """Steps (n, 2) east and north in pixels at places (n, 2), NaN where none is found."""
+    half, near = CHIP_PX // 2, min(_LOCAL_PX, radius)
+    first = [_seen(scenes[0], models[0], place, half + near, rectifier) for place in places]
+    second = [_seen(scenes[1], models[1], place, half + radius, rectifier) for place in places]
+    maps = [
+        correlation_map(patch, _middle(around, CHIP_PX))
+        for patch, around in zip(second, first, strict=True)
+    ]
+    known = [one for one in maps if one is not None]
     if not known:
         return np.full((len(places), 2), np.nan)
     # What all places have in common stands out where one place alone is ambiguous.
-    common = np.array(np.unravel_index(int(np.sum(known, axis=0).argmax()), known[0].shape))
-    near = min(_LOCAL_PX, radius)
-    first = np.clip(common - near, 0, 2 * (radius - near)).tolist()
-    size = CHIP_PX + 2 * near
-    return np.array(
-        [
-            _step(patch[first[0] : first[0] + size, first[1] : first[1] + size], chip)
-            + [first[1] + near - radius, radius - near - first[0]]
-            for patch, chip in zip(patches, chips, strict=True)
-        ]
+    total = np.sum(known, axis=0)
+    peak = np.array(np.unravel_index(int(total.argmax()), total.shape))
+    common = np.clip(peak, near, 2 * radius - near) - radius
+    row_col = np.array(
+        [_step(around, patch, common) for around, patch in zip(first, second, strict=True)]
     )
+    return row_col[:, ::-1] * [1.0, -1.0]
 
 
-def _step(patch: FloatImage, chip: FloatImage) -> Array:
-    """Pixels (2,) east and north from the middle of a patch to where a chip is found in it, or NaN."""
-    peak = find_chip(np.ascontiguousarray(patch), chip, _PEAK)
+def _step(first: FloatImage, second: FloatImage, common: IntArray) -> Array:
+    """Rows and columns (2,) from the middle of one image to where another shows the same, or NaN.
+
+    Args:
+        first: around the chip that is looked for.
+        second: around the same place, more.
+        common: where it is looked for.
+    """
+    lost = np.full(2, np.nan)
+    peak = find_chip(_middle(second, len(first), common), _middle(first, CHIP_PX), _PEAK)
     if peak.reason != FOUND:
-        return np.full(2, np.nan)
-    return np.array([peak.row_col[1], -peak.row_col[0]])
+        return lost
+    whole = np.round(peak.row_col).astype(np.int64)
+    back = find_chip(first, _middle(second, CHIP_PX, common + whole), _PEAK)
+    if back.reason != FOUND or np.hypot(*(back.row_col + peak.row_col - whole)) > _MUTUAL_PX:
+        return lost
+    return np.asarray(common + peak.row_col)
+
+
+def _middle(image: FloatImage, size: int, off: IntArray = _NOWHERE) -> FloatImage:
+    """The part (size, size) of an image around its middle, or off it."""
+    top, left = ((len(image) - size) // 2 + off).tolist()
+    return np.ascontiguousarray(image[top : top + size, left : left + size])
 
 
 def _seen(
