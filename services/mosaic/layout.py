@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import shapely
 
 from amers.services.errors import CoverageError
 from amers.services.imagery.scene import Scene, scene_gsd_m
@@ -108,10 +109,13 @@ class Layout:
 
     def overlapping(self) -> Iterator[tuple[int, int]]:
         """Pairs of scenes whose windows meet, the lower number first."""
-        for second, window in enumerate(self.windows):
-            for first in range(second):
-                if common_window(window, self.windows[first]) is not None:
-                    yield first, second
+        boxes = [
+            shapely.box(w.sample, w.line, w.sample + w.samples, w.line + w.lines) for w in self.windows
+        ]
+        pairs = shapely.STRtree(boxes).query(boxes).T
+        for first, second in sorted(map(tuple, pairs[pairs[:, 0] < pairs[:, 1]].tolist())):
+            if common_window(self.windows[first], self.windows[second]) is not None:
+                yield first, second
 
 
 def lay_out(scenes: Sequence[MosaicScene], terrain: Terrain, wanted: MosaicMap) -> Layout:
@@ -121,7 +125,7 @@ def lay_out(scenes: Sequence[MosaicScene], terrain: Terrain, wanted: MosaicMap) 
         CoverageError: no scene reaches the map, or the terrain does not reach a scene.
         InputError: the reference system is not known, or the map would be too large.
     """
-    ground = [seen_ground(one.scene, terrain) for one in scenes]
+    ground = [_ground(one, terrain) for one in scenes]
     first_lon = ground[0][0, 0]
     for lon_lat in ground:
         lon_lat[:, 0] += 360.0 * np.round((first_lon - lon_lat[0, 0]) / 360.0)
@@ -197,6 +201,19 @@ class Rectifier:
             rows, columns = inside(part.window, window)
             out[:, rows, columns] = part.pixels
         return out
+
+
+def _ground(one: MosaicScene, terrain: Terrain) -> Array:
+    """The ground that a scene shows.
+
+    Raises:
+        CoverageError: the terrain does not reach it; names the scene.
+    """
+    try:
+        return seen_ground(one.scene, terrain)
+    except CoverageError as error:
+        named = str(error).startswith(one.name)
+        raise CoverageError(str(error) if named else f"{one.name}: {error}") from error
 
 
 def _part_of(grid: MapGrid, outline: Array) -> MapGrid:

@@ -94,7 +94,7 @@ def _cut(cells: CellImages, number: int, window: Window, labels: Labels, valid: 
         return taken
     rows, columns = _around(both)
     old, new = before[rows, columns], valid[rows, columns]
-    if not (new & ~old).any():
+    if not (new & ~old).any() or min(old.shape) < 2:
         return taken
     if not (old & ~new).any():
         return valid

@@ -10,6 +10,7 @@ import pyogrio
 import pytest
 import rasterio
 import shapely
+from rasterio.transform import from_origin
 
 from amers.app.errors import InputError
 from amers.app.usecases.executors import ComputeOptions
@@ -18,9 +19,11 @@ from amers.app.usecases.mosaic import MosaicFile, MosaicGround, run_mosaic
 from amers.app.usecases.mosaic_scenes import MosaicFiles
 from amers.services.errors import AmersError
 from amers.services.formats.images.raster import write_raster
+from amers.services.formats.sensor_models.correction_json import format_correction
 from amers.services.mosaic import mosaic as mosaic_module
 from amers.services.mosaic.layout import MosaicMap
 from amers.services.mosaic.options import MosaicOptions
+from amers.services.sensors.correction import ImageCorrection
 from amers.services.sensors.rpc import RpcModel
 from tests.command_line import amers_here
 from tests.factories import affine_model
@@ -126,6 +129,63 @@ def test_the_command_tells_steps_and_scenes(images: tuple[Path, ...], tmp_path: 
     assert {tuple(pair["scenes"]) for pair in record["pairs"]} >= {("scene_0", "scene_1")}
     done = amers_here(words, {"PATH": ""})
     assert "seam_step  median 0.0" in done.stdout
+
+
+def test_registered_scenes_fit_where_delivered_ones_do_not(tmp_path: Path) -> None:
+    """The delivered model of the second scene is off by 6 lines and 8 samples: 10 pixels."""
+    off = np.array([6.0, 8.0])
+    paths = []
+    for number, left in enumerate(_LEFT[:2]):
+        delivered = model(left)
+        shift = number * off
+        paths.append(tmp_path / f"scene_{number}.tif")
+        pixels = picture()[0, : _SHAPE[0], left : left + _SHAPE[1]].astype(np.uint16)
+        write_raster(paths[-1], pixels, replace(delivered, image_offset=delivered.image_offset - shift))
+        half = np.array(_SHAPE) / 2.0
+        correction = ImageCorrection(np.column_stack([shift, np.zeros((2, 2))]), half, half)
+        folder = tmp_path / "registered" / f"scene_{number}"
+        folder.mkdir(parents=True)
+        text = format_correction(
+            correction,
+            "shift",
+            np.diag([0.04, 0.0, 0.0, 0.04, 0.0, 0.0]),
+            np.zeros(2),
+            applies_to="a test",
+            carried="by nothing",
+        )
+        (folder / "correction.json").write_text(text)
+    mosaic = run_mosaic(
+        MosaicFiles(tuple(paths), registered=tmp_path / "registered"),
+        MosaicGround(None, HEIGHT_M),
+        tmp_path / "m.tif",
+        MosaicOptions(),
+        wanted=MosaicMap(),
+        place=WorkPlace(None, ComputeOptions(1, None)),
+    )
+    assert mosaic.seam_step is not None
+    assert mosaic.seam_step["median_m"] < 0.1 * mosaic.gsd_m
+    assert mosaic.seam_step["delivered"]["median_m"] == pytest.approx(10.0 * mosaic.gsd_m, rel=0.02)
+    assert mosaic.scenes[0]["sigma_m"] == pytest.approx(0.2 * mosaic.gsd_m, rel=0.05)
+
+
+def test_a_scene_beyond_the_terrain_is_named(images: tuple[Path, ...], tmp_path: Path) -> None:
+    dem = tmp_path / "dem.tif"
+    with rasterio.open(
+        dem,
+        "w",
+        driver="GTiff",
+        height=20,
+        width=20,
+        count=1,
+        dtype="float32",
+        crs="EPSG:4326",
+        transform=from_origin(20.0, 20.0, 0.001, 0.001),
+    ) as file:
+        file.write(np.zeros((20, 20), np.float32), 1)
+    words = ["scene", "mosaic", *images, "-o", tmp_path / "m.tif", "--dem", dem]
+    done = amers_here([*words, "--vertical", "ellipsoid"], {"PATH": ""})
+    assert done.returncode != 0
+    assert "scene_0: the terrain does not cover" in " ".join(done.stderr.split())
 
 
 def test_scenes_outside_the_box_are_named(images: tuple[Path, ...], tmp_path: Path) -> None:

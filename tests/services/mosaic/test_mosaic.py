@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from amers.services.errors import CoverageError, InputError
+from amers.services.map_grid import MapGrid, xy_of_lon_lat
 from amers.services.mosaic.layout import MosaicMap, flat_terrain, lay_out
 from amers.services.mosaic.mosaic import make_mosaic
 from amers.services.mosaic.options import MosaicOptions
 from amers.services.mosaic.steps import seam_places
 from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import FloatImage
 from tests.services.mosaic.worlds import (
     GRID,
     GSD_M,
@@ -183,6 +185,33 @@ def test_other_bands_and_unknown_anchors_are_refused() -> None:
         mosaic_of([scene(0, pixels, grid)], level=True, anchor="nobody")
     with pytest.raises(InputError, match="a multiple of 512"):
         MosaicOptions(tile_px=500)
+
+
+def waves(grid: MapGrid) -> FloatImage:
+    """Ground (1, lines, samples) known at every position, in the pixels of a grid."""
+    at = np.stack(np.indices(grid.shape), axis=-1).reshape(-1, 2).astype(np.float64)
+    x, y = (xy_of_lon_lat(GRID.crs, grid.lon_lat(at)) - GRID.origin_xy).T
+    grey = 500.0 + sum(
+        80.0 * np.sin(2.0 * np.pi * (x * np.cos(angle) + y * np.sin(angle)) / length_m + angle)
+        for angle, length_m in ((0.3, 9.0), (1.2, 13.0), (2.0, 31.0), (2.9, 60.0))
+    )
+    return grey.reshape(1, *grid.shape).astype(np.float32)
+
+
+def test_scenes_in_other_zones_lie_on_one_map() -> None:
+    """The second image is on the map of the next zone, turned by four degrees against the first."""
+    first = replace(GRID, shape=(300, 300))
+    corner = xy_of_lon_lat("EPSG:32632", GRID.lon_lat(np.array([[0.0, 200.0]])))[0]
+    second = replace(GRID, crs="EPSG:32632", origin_xy=corner, shape=(300, 300))
+    scenes = [scene(k, waves(grid), grid) for k, grid in enumerate((first, second))]
+    mosaic = mosaic_of(scenes)
+    pixels, source = assembled(mosaic)
+    assert {1, 2} <= set(np.unique(source))
+    seen = source > 0
+    error = np.abs(pixels - waves(mosaic.grid))[:, seen]
+    assert np.quantile(error, 0.998) < 1.0  # the outermost half pixel of an image is not interpolated
+    assert mosaic.steps is not None
+    assert mosaic.steps.used.p90_m < a_twentieth_of_a_pixel_m
 
 
 def test_places_lie_on_seams_only() -> None:
