@@ -249,13 +249,17 @@ def _inputs(
     return {
         "version": version("amers"),
         "images": [
-            {**_fact(one.path), "model": hashlib.sha256(pickle.dumps(one.scene.scene.model)).hexdigest()}
+            {**_fact(one.path), "models": _digest((one.scene.scene.model, one.scene.delivered))}
             for one in read
         ],
         "ground": {**asdict(ground), **({} if dem is None else _fact(dem))},
         "options": asdict(options),
         "map": [wanted.crs, wanted.gsd_m, outline],
     }
+
+
+def _digest(value: object) -> str:
+    return hashlib.sha256(pickle.dumps(value)).hexdigest()
 
 
 def _fact(path: Path) -> dict[str, Any]:

@@ -29,8 +29,8 @@ class MosaicFiles:
     """The files that a mosaic is made from.
 
     Attributes:
-        images: with all their bands, which are the same in all of them. Where scenes were cut the same,
-            the first of them is shown.
+        images: raw scenes or ortho-images, all with the same bands. What lies whole within those given
+            before is not shown.
         registered: folder with the registrations of the images, one folder each, as `amers scene
             register-many -o` writes it.
         block: folder of a block that was made from the images, whose adjusted models are used.

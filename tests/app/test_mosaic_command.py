@@ -29,6 +29,8 @@ from tests.command_line import amers_here
 from tests.factories import affine_model
 from tests.services.mosaic.worlds import picture
 
+pytestmark = pytest.mark.long
+
 HEIGHT_M = 200.0
 _SHAPE = (400, 300)
 _LEFT = (0, 180, 360)
@@ -121,7 +123,7 @@ def test_two_processes_and_other_tiles_write_the_same_bytes(
 
 
 def test_the_command_tells_steps_and_scenes(images: tuple[Path, ...], tmp_path: Path) -> None:
-    words = ["scene", "mosaic", *images, "-o", tmp_path / "m.tif", "--height-m", HEIGHT_M]
+    words = ["scene", "mosaic", *images, "-o", tmp_path / "m.tif", "--height-m", HEIGHT_M, "--jobs", 1]
     done = amers_here([*words, "--json"], {"PATH": ""})
     assert done.returncode == 0, done.stderr
     record = json.loads(done.stdout)
@@ -192,7 +194,7 @@ def test_scenes_outside_the_box_are_named(images: tuple[Path, ...], tmp_path: Pa
     corner = model(0).locate(np.array([[100.0, 20.0], [300.0, 150.0]]), np.full(2, HEIGHT_M))
     (west, south), (east, north) = corner[:, :2].min(axis=0), corner[:, :2].max(axis=0)
     box = f"{west},{south},{east},{north}"
-    words = ["scene", "mosaic", *images, "-o", tmp_path / "m.tif", "--height-m", HEIGHT_M]
+    words = ["scene", "mosaic", *images, "-o", tmp_path / "m.tif", "--height-m", HEIGHT_M, "--jobs", 1]
     done = amers_here([*words, "--bbox", box, "--json"], {"PATH": ""})
     assert done.returncode == 0, done.stderr
     record = json.loads(done.stdout)

@@ -24,6 +24,8 @@ from tests.services.mosaic.worlds import (
     truth_on,
 )
 
+pytestmark = pytest.mark.long
+
 a_twentieth_of_a_pixel_m = 0.05 * GSD_M
 one_percent = 0.01
 a_tenth_of_a_pixel = 0.1 * 80.0 * 2.0 * np.pi * GSD_M / 9.0
