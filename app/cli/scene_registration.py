@@ -189,9 +189,9 @@ def outcome_of(
                 outcome = registered_outcome(request, register_one(request, new, receiver))
             except (InputError, ComputationError) as error:
                 _keep_only_failure(request, new, error)
-                run = json.loads((new / "report.json").read_text(encoding="utf-8"))["run"]
+                report = json.loads((new / "report.json").read_text(encoding="utf-8"))
                 outcome = failed_outcome(request, error)
-                outcome |= {"output": request.folder, "statements": run.get("statements", [])}
+                outcome |= {"output": request.folder, **_notes(report)}
             except Exception as error:
                 if isinstance(error, AmersError | ServiceError) or not has_report(error):
                     raise
@@ -251,7 +251,15 @@ def registered_outcome(request: SceneRequest, report: dict[str, Any]) -> Outcome
         "residual_rms_px": report["image_residuals_px"]["xy"]["rms"],
         **_check_figures(report["checks"]),
         "output": request.folder,
+        **_notes(report),
+    }
+
+
+def _notes(report: dict[str, Any]) -> dict[str, Any]:
+    """What a report notes of files and pixels; a service of an earlier version may not."""
+    return {
         "statements": report["run"].get("statements", []),
+        "pixel_findings": report["scene"].get("pixel_findings", []),
     }
 
 

@@ -13,6 +13,7 @@ from amers.app.cli.exit_status import SUCCESS
 from amers.app.cli.output import print_json, show, show_one, show_statements
 from amers.app.cli.scene_registration import Outcome
 from amers.app.errors import InputError
+from amers.app.printable import printable
 from amers.services.formats.images.scenes import scene_name
 from amers.services.quality.accuracy_statement import ON_THE_EARTH, RELATIVE
 from amers.services.reports.overview import OverviewRow, format_overview
@@ -53,6 +54,7 @@ def show_outcome(outcome: Outcome, *, as_json: bool) -> None:
         print_json(outcome)
     else:
         show_statements(outcome.get("statements", []))
+        _show_findings([outcome])
         show_one(_verdict_rows(outcome) | _other_rows(outcome, tuple(outcome)), as_json=False)
 
 
@@ -62,11 +64,19 @@ def show_outcomes(outcomes: list[Outcome], *, as_json: bool) -> None:
         print_json(outcomes)
         return
     show_statements(chain(*(outcome.get("statements", []) for outcome in outcomes)))
+    _show_findings(outcomes)
     rows = []
     for outcome in outcomes:
         row = _verdict_rows(outcome) | _other_rows(outcome, _TABLE)
         rows.append(row | {"reason": outcome["reason"] if outcome["exit_status"] else None})
     show(rows, as_json=False)
+
+
+def _show_findings(outcomes: list[Outcome]) -> None:
+    """Print on standard error what is wrong with the pixels of scenes."""
+    for outcome in outcomes:
+        for finding in outcome.get("pixel_findings", []):
+            typer.echo(f"amers: {printable(str(outcome['scene']))}: {finding['words']}", err=True)
 
 
 def write_overview(outcomes: list[Outcome], folder: Path) -> None:
@@ -104,7 +114,7 @@ def _verdict_rows(outcome: Outcome) -> dict[str, Any]:
 
 def _other_rows(outcome: Outcome, names: tuple[str, ...]) -> dict[str, Any]:
     """The other figures of an outcome, for people."""
-    shown = {"scene", "verdict", "verdict_scope", "statements", *_STATED}
+    shown = {"scene", "verdict", "verdict_scope", "statements", "pixel_findings", *_STATED}
     return {name: _rounded(outcome.get(name)) for name in names if name not in shown}
 
 

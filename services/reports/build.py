@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from amers.services.imagery.pixel_checks import PixelFinding
 from amers.services.imagery.scene import Scene, scene_footprint, scene_gsd_m
 from amers.services.misfit.affine_fit import Order
 from amers.services.misfit.displacement_components import BENDS, Component
@@ -81,7 +82,7 @@ def build_report(
     )
 
 
-def scene_record(scene: Scene, name: str) -> SceneRecord:
+def scene_record(scene: Scene, name: str, pixel_findings: tuple[PixelFinding, ...] = ()) -> SceneRecord:
     """The facts of a report about a scene, under a name for people."""
     lines, samples = scene.image.shape
     return SceneRecord(
@@ -93,6 +94,7 @@ def scene_record(scene: Scene, name: str) -> SceneRecord:
         model=_kind_of_model(scene),
         sigma_m=scene.sigma_m,
         footprint_lon_lat=scene_footprint(scene),
+        pixel_findings=pixel_findings,
     )
 
 

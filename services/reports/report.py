@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Literal
 
+from amers.services.imagery.pixel_checks import PixelFinding
 from amers.services.quality.accuracy import Accuracy, NormalisedError
 from amers.services.quality.accuracy_statement import AccuracyStatement, StatedAccuracy
 from amers.services.quality.cell_stability import CellStability
@@ -78,6 +79,7 @@ class SceneRecord:
         model: kind of the delivered model, such as "RPC".
         sigma_m: accuracy of the model before registration, one standard deviation a coordinate, metres.
         footprint_lon_lat: outline on the ground, degrees, not closed.
+        pixel_findings: what is wrong with its pixels; none in a clean image. No verdict depends on them.
     """
 
     name: str
@@ -88,6 +90,7 @@ class SceneRecord:
     model: str
     sigma_m: float
     footprint_lon_lat: Array
+    pixel_findings: tuple[PixelFinding, ...] = ()
 
     @property
     def shape(self) -> tuple[int, int]:

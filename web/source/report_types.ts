@@ -180,6 +180,17 @@ export interface OrderScore {
   left_out_px: number | null;
 }
 
+export interface PixelFinding {
+  kind: "repeated lines" | "repeated samples" | "lost lines" | "lost samples" | "enlarged by nearest neighbour" | "odd lines displaced" | "odd samples displaced" | "bands displaced" | "second image" | "part of another image";
+  line: number;
+  sample: number;
+  lines: number;
+  samples: number;
+  amount_px: number | null;
+  evidence: number | null;
+  words: string;
+}
+
 export interface PointCounts {
   visible: number;
   not_tried: number;
@@ -318,6 +329,7 @@ export interface SceneRecord {
   model: string;
   sigma_m: number | null;
   footprint_lon_lat: Numbers[];
+  pixel_findings: PixelFinding[];
 }
 
 export interface SearchStage {

@@ -1,5 +1,6 @@
 """The report of a registration that failed, written where its outputs would have been."""
 
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -11,8 +12,10 @@ from amers.app.errors import is_no_memory, is_no_room
 from amers.app.outages import outage_of
 from amers.app.usecases.registration.control_sources import ControlSet
 from amers.app.usecases.report_files import write_report
-from amers.services.errors import AmersError, CoverageError
+from amers.services.errors import AmersError, CoverageError, FormatError
+from amers.services.formats.images.band_registration import visible_bands
 from amers.services.formats.images.scenes import scene_name
+from amers.services.imagery.pixel_checks import PixelFinding, pixel_findings
 from amers.services.imagery.scene import Scene
 from amers.services.registration.context import SearchStage
 from amers.services.registration.options import RegistrationOptions
@@ -28,7 +31,7 @@ from amers.services.reports.failure import (
     next_steps,
 )
 from amers.services.reports.failure_pages import FAILURE_PAGE
-from amers.services.reports.report import BlockUsed, RunRecord
+from amers.services.reports.report import BlockUsed, RunRecord, SceneRecord
 from amers.services.statements import Statement, gathered
 from amers.services.types import Array
 
@@ -47,6 +50,7 @@ class Attempt:
         reference: name of the reference image, once it was chosen; "" before.
         stages: summaries of the searches, also of one that was refused.
         statements: of the files read, but for those of the scene.
+        pixel_findings: what is wrong with the pixels of the scene, once they were measured.
     """
 
     image: Path
@@ -58,6 +62,24 @@ class Attempt:
     reference: str = ""
     stages: list[SearchStage] = field(default_factory=list)
     statements: list[Statement] = field(default_factory=list)
+    pixel_findings: tuple[PixelFinding, ...] = ()
+
+    def measure_pixels(self) -> None:
+        """Note what is wrong with the pixels of the scene.
+
+        An image that cannot be read everywhere has no findings: what reads it next says why.
+        """
+        assert self.scene is not None
+        image = self.scene.image
+        with suppress(FormatError):
+            self.pixel_findings = pixel_findings(image, visible_bands(image)).findings
+
+    def scene_record(self) -> SceneRecord | UnreadScene:
+        """The facts about the scene; only its name where it was not read."""
+        name = scene_name(self.image)
+        if self.scene is None:
+            return UnreadScene(name)
+        return scene_record(self.scene, name, self.pixel_findings)
 
     def run_record(self) -> RunRecord:
         """How and when the registration was run; it ends now."""
@@ -87,8 +109,7 @@ def write_failure(folder: Path, attempt: Attempt, error: Exception) -> None:
 
 
 def _failure_report(attempt: Attempt, error: Exception) -> FailureReport:
-    name, scene = scene_name(attempt.image), attempt.scene
-    record = UnreadScene(name) if scene is None else scene_record(scene, name)
+    record = attempt.scene_record()
     stages, reason = tuple(attempt.stages), str(error)
     if not isinstance(error, AmersError):
         reason = f"an error that should not happen: {type(error).__name__}: {error}"

@@ -167,6 +167,7 @@ def _register_and_write(
 ) -> RegisteredScene:
     """Register one scene and write the outputs; what is done is noted in the attempt."""
     scene = attempt.scene = files.read()
+    attempt.measure_pixels()
     check_points = None
     if files.check_points is not None:
         check_points = read_check_points(files.check_points, files.check_heights, files.image, scene)
@@ -232,7 +233,7 @@ def write_registered(
     )
     report = build_report(
         registration,
-        scene_record(scene, scene_name(files.image)),
+        scene_record(scene, scene_name(files.image), attempt.pixel_findings),
         attempt.run_record(),
         RefinedModelRecord(refined.max_error_px, refined.note),
         figure_data(scene, control.points, control.chips, registration),

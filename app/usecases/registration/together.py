@@ -175,6 +175,7 @@ class _Scenes:
                 )
                 continue
             self.attempts[name].scene = scene
+            self.attempts[name].measure_pixels()
             taken.add(scene.acquisition.image_id)
             self.opened.append(_Read(name, self.place.address_of(name, one.image), one, scene))
 

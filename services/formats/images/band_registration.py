@@ -9,9 +9,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from amers.services.formats.images.bands import one_band
-from amers.services.formats.images.tiled_image import SceneImage
-from amers.services.imagery.source import Window
+from amers.services.errors import FormatError
+from amers.services.formats.images.bands import default_mix, one_band
+from amers.services.formats.images.masks import MaskedImage
+from amers.services.formats.images.raster import RasterImage
+from amers.services.formats.images.tiled_image import SceneImage, TiledImage
+from amers.services.imagery.source import ImageSource, Window
 from amers.services.matching.least_squares import covariance_from_influence, fit_chip
 from amers.services.statements import Statement, Subject, Use
 from amers.services.types import Array, FloatImage
@@ -86,6 +89,18 @@ def with_registered_bands(
     note = f"{listed} {found}; --bands chooses another one"
     name = names[bands.index(alone.bands[0])]
     return image.with_mix(alone), _statement(image, Use.ASSUMED, f"{name} alone", note)
+
+
+def visible_bands(image: ImageSource) -> tuple[SceneImage, ...]:
+    """The visible bands of an image each by itself; none where it has one, or is not that of files."""
+    opened = image.image if isinstance(image, MaskedImage) else image
+    if not isinstance(opened, RasterImage | TiledImage):
+        return ()
+    try:
+        bands = default_mix(opened.validity.colours, opened.path).bands
+    except FormatError:
+        return ()
+    return tuple(opened.with_mix(one_band(band)) for band in bands) if len(bands) > 1 else ()
 
 
 def _statement(image: SceneImage, use: Use, value: str, note: str) -> Statement:
