@@ -18,8 +18,10 @@ _ORDINARY = 98.0
 """Percentile of the contrast of lines that is the unit of a jump."""
 _LEAST_CONTRAST = 0.03
 """Least unit of a jump, logarithm: the noise of 2,048 independent pixels."""
-_FEWEST_CELLS, _LEAST_SHARE = 8, 0.25
+_FEWEST_CELLS, _LEAST_SHARE = 8, 0.5
 """Cells of a line that are known, and their share, below which a line tells nothing."""
+_QUANTILE = 0.35
+"""Of the contrast of the cells of a line that is its own: what a third of a line shows is no jump."""
 _BORDER = 4
 """First and last lines that are left aside: a filter makes others of them, and little lies beyond."""
 _BESIDE = 0.25
@@ -73,7 +75,7 @@ def repeated_lines(profile: LineProfile) -> list[RepeatedLines]:
 def jumps(profile: LineProfile) -> Array:
     """How far each line (n,) differs from the one before beyond its neighbours, in ordinary differences.
 
-    The contrast of a line is the median over its cells; oscillations that a resampling leaves are
+    The contrast of a line is a quantile over its cells; oscillations that a resampling leaves are
     removed; the unit is the contrast that 2 % of the lines exceed.
     """
     change, scale = _contrast(profile.change)
@@ -88,9 +90,9 @@ def _contrast(cells: FloatImage) -> tuple[Array, float]:
     known = np.isfinite(cells)
     told = known.sum(axis=1) >= max(_FEWEST_CELLS, _LEAST_SHARE * cells.shape[1])
     contrast = np.zeros(len(cells))
-    whole = known.all(axis=1)
-    contrast[whole] = np.median(cells[whole], axis=1)
-    contrast[told & ~whole] = np.nanmedian(cells[told & ~whole], axis=1)
+    whole = told & known.all(axis=1)
+    contrast[whole] = np.quantile(cells[whole], _QUANTILE, axis=1)
+    contrast[told & ~whole] = np.nanquantile(cells[told & ~whole], _QUANTILE, axis=1)
     if told.any():
         contrast[told] = without_periods(contrast[told])
     scale = float(np.percentile(contrast[told], _ORDINARY)) if told.any() else 0.0

@@ -14,8 +14,8 @@ from amers.services.types import FloatImage, IntArray
 
 CORNER_LIMIT = 6.2
 """Clearest corner of a part, see `clearest_corner`. Source: `benchmarks/pixel_checks.py`."""
-_LENGTHS = (4, 6, 8, 12, 16)
-"""Cells of a joint."""
+_LENGTHS = (8, 12, 16)
+"""Cells of a joint: shorter ones are those of roofs and fields."""
 _MOST_OSCILLATION = 0.3
 """Oscillation that all cells of a line share over what they do not, above which all is removed that they
 share: the image is enlarged."""

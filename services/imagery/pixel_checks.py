@@ -38,13 +38,14 @@ from amers.services.imagery.spectral_checks import (
     log_spectra,
     windows_of,
 )
-from amers.services.types import Array, FloatImage, IntArray
+from amers.services.types import Array, FloatImage
 
 _MOST_JUMPS = 8
 """Jumps of an image, beyond which they are the way of its sensor or of its compression."""
 _MOST_BLOCKING = 1.0
 """Blocking of an image, see `PixelStatistics`, above which its blocks have joints and second images of
 their own: that of JPEG at a quality of about 20."""
+_NAMES = ("line", "sample")
 _NOTHING = Echo(0.0, 0.0, 0, 0)
 
 
@@ -140,13 +141,8 @@ def pixel_findings(image: ImageSource, bands: Sequence[ImageSource] = ()) -> Pix
     if max(statistics.doubled) > DOUBLED_SHARE:
         found = [_doubled(image.shape, statistics)]
     else:
-        found = _odd(image.shape, statistics)
-        found = _of_lines(image, statistics, jumps_too=not found) + found
-        if not found and statistics.blocking <= _MOST_BLOCKING:
-            found = _part(image, statistics.corner)
+        found = _in_places(image, statistics)
     found += _bands(image.shape, statistics)
-    if statistics.blocking <= _MOST_BLOCKING:
-        found += _second_image(image.shape, statistics.echo)
     return PixelFindings(tuple(found), statistics.blur_px, statistics.blocking)
 
 
@@ -196,20 +192,28 @@ def _blocking(profile: LineProfile) -> float:
     return float(np.expm1(max(phases.max() - np.median(phases), 0.0)))
 
 
-def _of_lines(image: ImageSource, statistics: PixelStatistics, *, jumps_too: bool) -> list[PixelFinding]:
-    """Findings of repeated lines and samples and, unless something else makes jumps, of lost ones."""
-    found = []
-    for axis, name in enumerate(("line", "sample")):
-        source = image if axis == 0 else TransposedImage(image)
-        repeated = list(statistics.repeated[axis])
-        lost = lost_lines(statistics.jumps[axis], repeated)
-        found += [_repeated(one, source.shape, axis, name) for one in repeated]
-        if jumps_too and len(lost) <= _MOST_JUMPS:
-            found += _lost(source, lost, statistics.jumps[axis], axis, name)
-    return found
+def _in_places(image: ImageSource, statistics: PixelStatistics) -> list[PixelFinding]:
+    """Findings of an image that was not enlarged; one fault has one name, the first that explains it."""
+    found = [
+        _repeated(one, image.shape if axis == 0 else image.shape[::-1], axis)
+        for axis in range(2)
+        for one in statistics.repeated[axis]
+    ]
+    odd, has_blocks = _odd(image.shape, statistics), statistics.blocking > _MOST_BLOCKING
+    twice = []
+    if not (found or odd or has_blocks):
+        twice = _second_image(image.shape, statistics.echo)
+    if odd or twice:
+        return found + odd + twice
+    lost = [one for axis in range(2) for one in _lost(image, statistics, axis)]
+    part = [] if found or has_blocks else _part(image, statistics.corner)
+    if part and all(one.evidence < part[0].evidence for one in lost):
+        return part
+    return found + lost
 
 
-def _repeated(one: RepeatedLines, shape: tuple[int, int], axis: int, name: str) -> PixelFinding:
+def _repeated(one: RepeatedLines, shape: tuple[int, int], axis: int) -> PixelFinding:
+    name = _NAMES[axis]
     last, original = one.first + one.count - 1, one.first - one.lag
     words = (
         f"{name}s {one.first} to {last} repeat {name}s {original} to {original + one.count - 1}: what "
@@ -221,10 +225,13 @@ def _repeated(one: RepeatedLines, shape: tuple[int, int], axis: int, name: str) 
     return PixelFinding(kind, *place, float(one.count), float(one.count), words)
 
 
-def _lost(source: ImageSource, lost: IntArray, score: Array, axis: int, name: str) -> list[PixelFinding]:
+def _lost(image: ImageSource, statistics: PixelStatistics, axis: int) -> list[PixelFinding]:
     """Findings of jumps, and of lines that are repeated without being identical."""
+    source = image if axis == 0 else TransposedImage(image)
+    score, name = statistics.jumps[axis], _NAMES[axis]
+    lost = lost_lines(score, list(statistics.repeated[axis])).tolist()
     found = []
-    for line in lost.tolist():
+    for line in lost if len(lost) <= _MOST_JUMPS else []:
         amount = jump_px(source, line)
         kind = (Fault.LOST_LINES, Fault.LOST_SAMPLES)[axis]
         size = "an unknown number of them" if np.isnan(amount) else f"roughly {amount:.0f} of them"
@@ -232,8 +239,8 @@ def _lost(source: ImageSource, lost: IntArray, score: Array, axis: int, name: st
         if amount < 0.0:
             kind = (Fault.REPEATED_LINES, Fault.REPEATED_SAMPLES)[axis]
             words = f"{name}s {line} to {line - amount - 1:.0f} repeat the {-amount:.0f} {name}s before"
-        evidence = float(score[line]) / JUMP_LIMIT
         place = _place(axis, line - 1, 2, source.shape)
+        evidence = float(score[line]) / JUMP_LIMIT
         found.append(PixelFinding(kind, *place, abs(amount), evidence, words))
     return found
 
@@ -284,10 +291,13 @@ def _part(image: ImageSource, corner: Corner) -> list[PixelFinding]:
 def _odd(shape: tuple[int, int], statistics: PixelStatistics) -> list[PixelFinding]:
     """Findings of odd lines and samples that lie aside."""
     found = []
-    for axis, (shift, name) in enumerate(zip(statistics.fields, ("line", "sample"), strict=True)):
+    echo = statistics.echo
+    for axis, (shift, name) in enumerate(zip(statistics.fields, _NAMES, strict=True)):
         along, across = np.abs(shift.line_sample)
         evidence = max(along / FIELDS_LIMIT_PX[0], across / FIELDS_LIMIT_PX[1])
-        if evidence > 1.0 and shift.score >= LEAST_SHIFT_SCORE:
+        # Odd lines aside look like a second image, one line away.
+        is_second_image = echo.score > ECHO_LIMIT and abs((echo.line, echo.sample)[axis]) > 1
+        if evidence > 1.0 and shift.score >= LEAST_SHIFT_SCORE and not is_second_image:
             line, sample = shift.line_sample if axis == 0 else shift.line_sample[::-1]
             words = (
                 f"odd {name}s lie {line:+.2f} px in line and {sample:+.2f} px in sample from where even "

@@ -145,12 +145,15 @@ def displacement(first: Sequence[FloatImage], second: Sequence[FloatImage]) -> S
     if not size.any():
         return unknown
     correlation = fft.irfft2(cross / np.maximum(size, 1e-20), s=(lines, samples))
-    peak = np.array(np.unravel_index(int(correlation.argmax()), correlation.shape), dtype=np.float64)
+    # Where one image is bright, another band may be dark.
+    at = int(np.abs(correlation).argmax())
+    cross = cross * np.sign(correlation.flat[at])
+    peak = np.array(np.unravel_index(at, correlation.shape), dtype=np.float64)
     peak = np.where(peak > np.array([lines, samples]) / 2, peak - [lines, samples], peak)
     frequencies = fft.fftfreq(lines)[:, None], fft.rfftfreq(samples)[None, :]
     coherence = size**2 / np.maximum(power[0] * power[1], 1e-30)
     shift = _refined(cross, coherence, frequencies, -peak)
-    return Shift(shift, float(correlation.max() / correlation.std()))
+    return Shift(shift, float(np.abs(correlation).max() / correlation.std()))
 
 
 def _refined(cross: Array, coherence: Array, frequencies: tuple[Array, Array], start: Array) -> Array:
