@@ -138,12 +138,16 @@ def pixel_findings(image: ImageSource, bands: Sequence[ImageSource] = ()) -> Pix
         bands: its bands, where it has several that show the same.
     """
     statistics = pixel_statistics(image, bands)
+    return PixelFindings(findings_of(image, statistics), statistics.blur_px, statistics.blocking)
+
+
+def findings_of(image: ImageSource, statistics: PixelStatistics) -> tuple[PixelFinding, ...]:
+    """The findings that the statistics of an image exceed their limits with."""
     if max(statistics.doubled) > DOUBLED_SHARE:
         found = [_doubled(image.shape, statistics)]
     else:
         found = _in_places(image, statistics)
-    found += _bands(image.shape, statistics)
-    return PixelFindings(tuple(found), statistics.blur_px, statistics.blocking)
+    return (*found, *_bands(image.shape, statistics))
 
 
 def pixel_statistics(image: ImageSource, bands: Sequence[ImageSource] = ()) -> PixelStatistics:
