@@ -109,6 +109,10 @@ COMMANDS: Tree = {
                 "surface:points",
                 "Write the cells of a surface as a point cloud, for CloudCompare and QGIS.",
             ),
+            "difference": Command(
+                "surface:difference",
+                "Compare two surfaces: what rose and what sank, with its accuracy, on a map.",
+            ),
         },
     ),
     "vectors": Group(

@@ -15,6 +15,7 @@ from amers.app.errors import InputError
 from amers.app.usecases.executors import ComputeOptions
 from amers.app.usecases.image_production import WorkPlace
 from amers.app.usecases.surface import SurfaceFiles, run_surface
+from amers.app.usecases.surface_difference import write_surface_difference
 from amers.app.usecases.surface_points import write_surface_points
 from amers.services.surface.options import MOST_FILL_CELLS, SurfaceOptions
 
@@ -101,6 +102,27 @@ def points(
     with shown_progress() as progress:
         cloud = write_surface_points(surface, output, max_sigma_m=max_sigma_m, progress=progress)
     show_one(asdict(cloud), as_json=as_json)
+
+
+def difference(
+    earlier: Annotated[Path, typer.Argument(exists=True, help="As `amers surface make` writes it.")],
+    later: Annotated[Path, typer.Argument(exists=True, help="The same of another date.")],
+    *,
+    output: Annotated[Path, typer.Option("-o", "--output", help="GeoTIFF to write.")],
+    align: Annotated[
+        bool, typer.Option(help="Move the later surface onto the earlier one, in position and height.")
+    ] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Compare two surfaces: what rose and what sank, with its accuracy, on a map.
+
+    The file has three bands: height of the later above the earlier surface, its standard deviation, and
+    their ratio. The shift of the later surface by which both agree on most ground is told; without it
+    (--no-align), a common error of all heights is a difference too.
+    """
+    with shown_progress() as progress:
+        found = write_surface_difference(earlier, later, output, align=align, progress=progress)
+    show_one(asdict(found), as_json=as_json)
 
 
 def _range(text: str) -> tuple[float, float]:
