@@ -96,14 +96,16 @@ def measure(folder: Path, side: int, jobs: int, answer: "multiprocessing.Queue[O
         place=WorkPlace(work, ComputeOptions(jobs)),
     )
     wall_s = time.perf_counter() - begun
-    spent = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    own = resource.getrusage(resource.RUSAGE_SELF)
+    # The server of the processes forks them, so that they are no children of this one.
+    elsewhere_s = sum(effort.cpu_s for effort in surface.effort.values()) if jobs > 1 else 0.0
     kept = sum(path.stat().st_size for path in work.rglob("*") if path.is_file())
     answer.put(
         Outcome(
             side,
             jobs,
             round(wall_s, 1),
-            round(sum(one.ru_utime + one.ru_stime for one in spent), 1),
+            round(own.ru_utime + own.ru_stime + elsewhere_s, 1),
             round(memory_mib("VmHWM")),
             round(kept / 2**20),
             round(surface.cells["has a height"] / (surface.lines * surface.samples), 3),
