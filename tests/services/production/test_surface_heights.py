@@ -270,9 +270,9 @@ def test_surfaces_of_points_in_a_town_agree_with_lidar_as_stated(real_data: Path
     le90_m = float(np.quantile(np.abs(error_m[certain]), 0.9))
     print(
         f"{known.sum()} of {seen.sum()} points, lidar {shift[0]}, {shift[1]} m off: chips "
-        f"{nmad(chips_off_m[known]):.2f} m, surface {nmad(error_m[known]):.2f} m, {within:.2f} within 1 m, "
-        f"90 % intervals hold {held:.2f}; 85 % that are certain: {nmad(error_m[certain]):.2f} m, LE90 "
-        f"{le90_m:.2f} m"
+        f"{nmad(chips_off_m[known]):.2f} m, surface {nmad(error_m[known]):.2f} m, {within:.2f} within "
+        f"1 m, 90 % intervals hold {held:.2f}; 85 % that are certain: {nmad(error_m[certain]):.2f} m, "
+        f"LE90 {le90_m:.2f} m"
     )
     assert seen.sum() > 60
     assert known.sum() > 0.95 * seen.sum()
