@@ -6,7 +6,7 @@ either with adjusted models, as `amers production run` makes them. *Within 1 m* 
 of the lidar surface, also of those without a height; its vertical datum is not stated, so that the
 median is removed, and the horizontal offset is estimated to a cell. *Holds* are the shares of the 90 %
 intervals that contain the truth, of all cells and of those whose surroundings are flat.
-Run: python -m benchmarks.surface --town BLOCK --hills BLOCK
+Run: python -m benchmarks.surface --town BLOCK --hills BLOCK [--cars COMMAND]
 """
 
 import os
@@ -28,6 +28,7 @@ from amers.services.map_grid import MapGrid
 from amers.services.surface.options import SurfaceOptions
 from amers.services.surface.surface import make_surface, surface_tiles
 from amers.services.types import Array, FloatImage
+from benchmarks._cars import cars_surface
 from benchmarks._measuring import keep, memory_mib, print_table
 
 TOWN, HILLS = "wv3_jacksonville", "phr_calanques_triplet"
@@ -42,9 +43,13 @@ SETS = {
     "pair of one pass": (HILLS, ("01", "03")),
     "triplet of one pass": (HILLS, ("01", "02", "03")),
 }
+LARGEST_OF_PEER = 3
+"""Scenes of the largest set that CARS makes too: its pairs take a minute and more."""
 FLAT_M = 0.3
 """Largest range of the truth within 5 x 5 cells of flat ground."""
 OFFSETS = range(-4, 5)
+FAR = 5.0
+"""Errors of more sigmas are counted."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,7 @@ class Outcome:
     """One surface beside the truth; see the module."""
 
     scenes: str
-    fill_cells: int
+    made: str
     pairs: int
     covered: float
     within_1_m: float
@@ -60,23 +65,18 @@ class Outcome:
     nmad_m: float
     flat_nmad_m: float
     le90_m: float
-    holds: float
-    holds_flat: float
+    holds: float | None
+    holds_flat: float | None
+    beyond_5_sigma: float | None
     cpu_s: float
     memory_mib: float
 
 
 def outcome(folder: Path, block: Path, name: str, fill_cells: int) -> Outcome:
     """A surface of one set of scenes over the grid of the truth."""
-    data, numbers = SETS[name]
-    town = data == TOWN
-    truth_file = folder / data / ("lidar_west.tif" if town else "expected_output/dsm.tif")
-    truth, grid = read_truth(truth_file)
-    stems = [f"{'jax' if town else 'img'}_{number}" for number in numbers]
-    scenes = [
-        read_scene(folder / data / f"{stem}.tif", block / "models" / f"{stem}_RPC.TXT", sigma_m=1.0)
-        for stem in stems
-    ]
+    images = images_of(folder, block, name)
+    truth, grid = truth_of(folder, name)
+    scenes = [read_scene(image, model, sigma_m=1.0) for image, model in images.items()]
     begun = time.process_time()
     surface = make_surface(scenes, SurfaceOptions(fill_cells=fill_cells), grid=grid)
     heights, sigmas = (np.full(grid.shape, np.nan, dtype=np.float32) for _ in range(2))
@@ -84,25 +84,63 @@ def outcome(folder: Path, block: Path, name: str, fill_cells: int) -> Outcome:
         w = tile.window
         place = np.s_[w.line : w.line + w.lines, w.sample : w.sample + w.samples]
         heights[place], sigmas[place] = tile.height_m, tile.sigma_m
-    cpu_s = time.process_time() - begun
-    error_m, sigma_m = (beside if town else straight)(heights, sigmas, truth)
+    took = (time.process_time() - begun, memory_mib("VmHWM"))
+    made = f"{fill_cells} cells filled"
+    return judged(name, made, len(surface.pairs), (heights, sigmas, truth), took)
+
+
+def peer(folder: Path, block: Path, name: str, command: str) -> Outcome:
+    """The surface that CARS makes of one set of scenes, which states no sigmas."""
+    images = images_of(folder, block, name)
+    truth, grid = truth_of(folder, name)
+    made = cars_surface(command, images, grid)
+    count = len(images) * (len(images) - 1) // 2
+    heights = (made.heights, np.full(grid.shape, np.nan, dtype=np.float32), truth)
+    return judged(name, "CARS", count, heights, (made.cpu_s, made.memory_mib))
+
+
+def judged(
+    name: str,
+    made: str,
+    pairs: int,
+    heights: tuple[FloatImage, FloatImage, FloatImage],
+    took: tuple[float, float],
+) -> Outcome:
+    """Heights and sigmas beside the truth."""
+    found, sigmas, truth = heights
+    town = SETS[name][0] == TOWN
+    error_m, sigma_m = (beside if town else straight)(found, sigmas, truth)
     known, flat = np.isfinite(error_m), np.isfinite(error_m) & flat_cells(truth)
     hits = np.abs(error_m) < 1.6449 * sigma_m
+    stated = bool(np.isfinite(sigmas).any())
     return Outcome(
         name,
-        fill_cells,
-        len(surface.pairs),
-        float(np.isfinite(heights).mean()),
+        made,
+        pairs,
+        float(np.isfinite(found).mean()),
         float((np.abs(error_m[known]) < 1.0).sum() / np.isfinite(truth).sum()),
         None if town else float(np.median(error_m[known])),
         nmad(error_m[known]),
         nmad(error_m[flat]),
         float(np.quantile(np.abs(error_m[known]), 0.9)),
-        float(hits[known].mean()),
-        float(hits[flat].mean()),
-        cpu_s,
-        memory_mib("VmHWM"),
+        float(hits[known].mean()) if stated else None,
+        float(hits[flat].mean()) if stated else None,
+        float((np.abs(error_m) > FAR * sigma_m)[known].mean()) if stated else None,
+        *took,
     )
+
+
+def images_of(folder: Path, block: Path, name: str) -> dict[Path, Path]:
+    """The images of a set, and the files of their adjusted models."""
+    data, numbers = SETS[name]
+    stems = [f"{'jax' if data == TOWN else 'img'}_{number}" for number in numbers]
+    return {folder / data / f"{s}.tif": block / "models" / f"{s}_RPC.TXT" for s in stems}
+
+
+def truth_of(folder: Path, name: str) -> tuple[FloatImage, MapGrid]:
+    """The heights that a set is compared with, and their grid."""
+    data = SETS[name][0]
+    return read_truth(folder / data / ("lidar_west.tif" if data == TOWN else "expected_output/dsm.tif"))
 
 
 def read_truth(path: Path) -> tuple[FloatImage, MapGrid]:
@@ -147,29 +185,37 @@ def nmad(errors: Array) -> float:
     return float(1.4826 * np.median(np.abs(errors - np.median(errors))))
 
 
+def share(value: float | None, digits: int) -> str | None:
+    """A share as text; None where there is none."""
+    return None if value is None else f"{value:.{digits}f}"
+
+
 def main() -> None:
     """Make all surfaces, with gaps and filled, and print them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--town", type=Path, required=True, help=f"block of {TOWN}")
     parser.add_argument("--hills", type=Path, required=True, help=f"block of {HILLS}")
+    parser.add_argument("--cars", help="command of CARS, which makes the same surfaces")
     parser.add_argument("--only", help="part of the names of the sets")
     arguments = parser.parse_args()
     folder = Path(os.environ["AMERS_REAL_DATA"])
     blocks = {TOWN: arguments.town, HILLS: arguments.hills}
     names = [name for name in SETS if (arguments.only or "") in name]
     outcome(folder, blocks[SETS[names[0]][0]], names[0], 0)  # compiles
-    outcomes = [
-        outcome(folder, blocks[SETS[name][0]], name, cells)
-        for name in names
-        for cells in (0, SurfaceOptions().fill_cells)
-    ]
+    outcomes = []
+    for name in names:
+        block = blocks[SETS[name][0]]
+        for cells in (0, SurfaceOptions().fill_cells):
+            outcomes.append(outcome(folder, block, name, cells))
+        if arguments.cars and len(SETS[name][1]) <= LARGEST_OF_PEER:
+            outcomes.append(peer(folder, block, name, arguments.cars))
     keep("surface", [asdict(one) for one in outcomes])
     print_table(
         "Surfaces",
         outcomes,
         {
             "scenes": lambda one: one.scenes,
-            "filled": lambda one: f"{one.fill_cells} cells",
+            "made": lambda one: one.made,
             "pairs": lambda one: one.pairs,
             "covered": lambda one: f"{one.covered:.3f}",
             "within 1 m": lambda one: f"{one.within_1_m:.3f}",
@@ -177,8 +223,9 @@ def main() -> None:
             "NMAD, m": lambda one: f"{one.nmad_m:.3f}",
             "flat, m": lambda one: f"{one.flat_nmad_m:.3f}",
             "LE90, m": lambda one: f"{one.le90_m:.2f}",
-            "holds": lambda one: f"{one.holds:.2f}",
-            "holds, flat": lambda one: f"{one.holds_flat:.2f}",
+            "holds": lambda one: share(one.holds, 2),
+            "holds, flat": lambda one: share(one.holds_flat, 2),
+            "5 sigma": lambda one: share(one.beyond_5_sigma, 4),
             "CPU s": lambda one: f"{one.cpu_s:.1f}",
             "MiB": lambda one: f"{one.memory_mib:.0f}",
         },

@@ -108,8 +108,8 @@ class SemiGlobal:
             there is no texture.
     """
 
-    small_penalty: int = 18
-    large_penalty: int = 150
+    small_penalty: int = 14
+    large_penalty: int = 80
     halving_step: float = 0.5
     max_difference_px: float = 0.75
     smallest_patch_px: int = 100
