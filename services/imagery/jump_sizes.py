@@ -83,7 +83,7 @@ def jump_px(image: ImageSource, line: int) -> float:
         if len(sides) < _COMPARED:
             return float("nan") if apart == 2 else float(apart - 2)
         with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = np.log(across / np.nanmean(sides, axis=0))
+            ratio = np.log(across / _means(sides))
         finite = ratio[np.isfinite(ratio)]
         if not len(finite):
             return float("nan")
@@ -106,16 +106,23 @@ def _differences(pixels: list[FloatImage], apart: int) -> Array:
     return np.concatenate(found, axis=1).astype(np.float64)
 
 
+def _means(differences: Array) -> Array:
+    """Means (parts,) over the lines where differences (lines, parts) are known; NaN where none is."""
+    known = np.isfinite(differences)
+    total = np.where(known, differences, 0.0).sum(axis=0)
+    return np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
+
+
 def _repeated(pixels: list[FloatImage], at: int) -> int:
     """How many lines are repeated, exactly or not, before a line; 0 when none are seen to be."""
-    usual = np.nanmean(_differences(pixels, 1), axis=0)
+    usual = _means(_differences(pixels, 1))
     best, lag = _ALIKE, 0
     for apart in range(2, at):
         alike = _differences(pixels, apart)[at - apart : at - apart + min(_COMPARED, apart)]
         if len(alike) < 2:
             break
         with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = np.nanmean(alike, axis=0) / usual
+            ratio = _means(alike) / usual
         finite = ratio[np.isfinite(ratio)]
         if len(finite) and np.median(finite) < best:
             best, lag = float(np.median(finite)), apart

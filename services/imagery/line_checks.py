@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amers.services.imagery.line_profiles import LineProfile, without_periods
+from amers.services.imagery.line_profiles import LineProfile, quantile_of_cells, without_periods
 from amers.services.types import Array, BoolArray, FloatImage, IntArray
 
 LEAST_TEXTURE = 32
@@ -12,7 +12,7 @@ LEAST_TEXTURE = 32
 blocks of a compression, may equal another one."""
 DOUBLED_SHARE = 0.2
 """Share of lines that equal the one before, above which the image is enlarged by nearest neighbour."""
-JUMP_LIMIT = 2.6
+JUMP_LIMIT = 3.1
 """Largest jump between neighbouring lines, see `jumps`. Source: `benchmarks/pixel_checks.py`."""
 _ORDINARY = 98.0
 """Percentile of the contrast of lines that is the unit of a jump."""
@@ -56,7 +56,11 @@ def doubled_share(profile: LineProfile) -> float:
 
 
 def repeated_lines(profile: LineProfile) -> list[RepeatedLines]:
-    """Runs of lines with texture that equal earlier ones, in order."""
+    """Runs of lines with texture that equal earlier ones, in order.
+
+    What is repeated once is repeated whole, unless the image ends. Lines that are mirrored at a border,
+    as filters do, equal others one by one.
+    """
     found: list[RepeatedLines] = []
     last: dict[float, int] = {}
     for line in np.flatnonzero(profile.detailed >= LEAST_TEXTURE).tolist():
@@ -65,11 +69,17 @@ def repeated_lines(profile: LineProfile) -> list[RepeatedLines]:
         last[number] = line
         if original is None:
             continue
-        if found and found[-1].first + found[-1].count == line:
-            found[-1] = RepeatedLines(found[-1].first, found[-1].count + 1, found[-1].lag)
+        lag = line - original
+        if found and (found[-1].first + found[-1].count, found[-1].lag) == (line, lag):
+            found[-1] = RepeatedLines(found[-1].first, found[-1].count + 1, lag)
         else:
-            found.append(RepeatedLines(line, 1, line - original))
-    return found
+            found.append(RepeatedLines(line, 1, lag))
+    lines = len(profile.number)
+    return [
+        one
+        for one in found
+        if one.count >= one.lag or (one.first + one.count == lines and one.count >= _BORDER)
+    ]
 
 
 def jumps(profile: LineProfile) -> Array:
@@ -90,9 +100,7 @@ def _contrast(cells: FloatImage) -> tuple[Array, float]:
     known = np.isfinite(cells)
     told = known.sum(axis=1) >= max(_FEWEST_CELLS, _LEAST_SHARE * cells.shape[1])
     contrast = np.zeros(len(cells))
-    whole = told & known.all(axis=1)
-    contrast[whole] = np.quantile(cells[whole], _QUANTILE, axis=1)
-    contrast[told & ~whole] = np.nanquantile(cells[told & ~whole], _QUANTILE, axis=1)
+    contrast[told] = quantile_of_cells(cells[told], _QUANTILE)
     if told.any():
         contrast[told] = without_periods(contrast[told])
     scale = float(np.percentile(contrast[told], _ORDINARY)) if told.any() else 0.0

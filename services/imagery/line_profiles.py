@@ -1,6 +1,6 @@
 """What every line of an image, or every sample, has in common with the one before, in cells along it.
 
-The image is read once along each axis, piece by piece. Of an image wider than 2,048 pixels, eight strips
+The image is read once along each axis, piece by piece. Of an image wider than 2,048 pixels, four strips
 evenly over the width are read.
 """
 
@@ -12,9 +12,9 @@ from numba import njit
 from amers.services.imagery.source import ImageSource, Window
 from amers.services.types import Array, BoolArray, FloatImage, IntArray
 
-STRIPS, STRIP_PX = 8, 256
+STRIPS, STRIP_PX = 4, 512
 """Strips of an image that is wider than all of them, and pixels of each across."""
-_AT_ONCE = 512
+_AT_ONCE = 1024
 """Lines read at a time."""
 _CELLS, _CELL_PX = 64, 16
 """Cells along a line, at most, and pixels of one, at least."""
@@ -192,6 +192,13 @@ def _compare(
             enough = 2 * count >= borders[cell + 1] - borders[cell]
             means[0, i, cell] = change / count if enough else np.nan
             means[1, i, cell] = mixed / count_mixed if enough and count_mixed else np.nan
+
+
+def quantile_of_cells(cells: FloatImage, share: float) -> FloatImage:
+    """A quantile (n,) over the known ones of cells (n, m) of each line; NaN where none is known."""
+    known = np.isfinite(cells).sum(axis=1)
+    at = np.rint(share * np.maximum(known - 1, 0)).astype(np.int64)
+    return np.take_along_axis(np.sort(cells, axis=1), at[:, None], axis=1)[:, 0]
 
 
 def without_periods(series: Array | FloatImage) -> Array:

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from amers.services.imagery.line_profiles import LineProfile, without_periods
+from amers.services.imagery.line_profiles import LineProfile, quantile_of_cells, without_periods
 from amers.services.types import FloatImage, IntArray
 
 CORNER_LIMIT = 6.2
@@ -81,7 +81,7 @@ def _standardised(profile: LineProfile) -> FloatImage:
     parts = []
     for cells in (profile.change, profile.mixed):
         bounded = np.clip(np.nan_to_num(cells), _LEAST, _MOST)
-        shared = np.median(bounded, axis=1)
+        shared = quantile_of_cells(bounded, 0.5)
         oscillation = shared - without_periods(shared)
         is_enlarged = oscillation.std() > _MOST_OSCILLATION * bounded.std()
         bounded -= (shared if is_enlarged else oscillation)[:, None].astype(np.float32)

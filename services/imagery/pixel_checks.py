@@ -219,10 +219,10 @@ def _in_places(image: ImageSource, statistics: PixelStatistics) -> list[PixelFin
 def _repeated(one: RepeatedLines, shape: tuple[int, int], axis: int) -> PixelFinding:
     name = _NAMES[axis]
     last, original = one.first + one.count - 1, one.first - one.lag
-    words = (
-        f"{name}s {one.first} to {last} repeat {name}s {original} to {original + one.count - 1}: what "
-        f"follows may lie {one.count} px from its place"
-    )
+    words = f"{name}s {one.first} to {last} repeat {name}s {original} to {original + one.count - 1}"
+    if one.count == 1:
+        words = f"{name} {one.first} repeats {name} {original}"
+    words += f": what follows may lie {one.count} px from its place"
     kind = (Fault.REPEATED_LINES, Fault.REPEATED_SAMPLES)[axis]
     # Identical lines have no limit but their number: one line of texture is enough.
     place = _place(axis, one.first, one.count, shape)

@@ -53,7 +53,7 @@ def test_repeated_lines_are_named_with_their_lines(name: str, dtype: str) -> Non
             (one,) = found(rounded(repeated(pixels, first, count), dtype))
             assert (one.kind, one.line, one.lines) == (Fault.REPEATED_LINES, first, count)
             assert (one.sample, one.samples, one.amount_px) == (0, SHAPE[1], count)
-            assert f"lines {first} to {first + count - 1}" in one.words
+            assert f"line{'s' if count > 1 else ''} {first} " in one.words
 
 
 def test_repeated_samples_are_named_with_their_samples() -> None:
@@ -181,6 +181,7 @@ CLEAN: dict[str, Callable[[FloatImage], FloatImage]] = {
     "rotated": _rotated,
     "water": _with_water,
     "saturated": _saturated,
+    "mirrored": lambda pixels: np.pad(pixels[7:-9, 5:-11], ((7, 9), (5, 11)), mode="reflect"),
     "other gain": lambda pixels: np.concatenate([pixels[:300], 1.2 * pixels[300:] + 60.0]),
     "changed": lambda pixels: changed(pixels, 300, 100),
     "haze": lambda pixels: hazy(pixels, 300, 0.4),
@@ -249,5 +250,5 @@ def test_a_large_image_is_read_by_pieces_and_its_faults_are_seen() -> None:
     image = Watched(lost(large, 1800, 12))
     statistics = pixel_statistics(image)
     assert int(statistics.jumps[0].argmax()) == 1800
-    assert max(one.lines * one.samples for one in image.windows) < 300_000
+    assert max(one.lines * one.samples for one in image.windows) < 600_000
     assert sum(one.lines * one.samples for one in image.windows) < 20_000_000
