@@ -2,8 +2,8 @@
 
 Needs AMERS_REAL_DATA. Each image of one band, and each band of the others, is clean; the first bands are
 distorted in all kinds, amounts and places. Whole places are kept apart: the limit of each statistic is
-set on half of the places, 15 % above its largest value on clean images there, or at the geometric
-mean of that and the 5 % quantile of distorted ones where this is larger; it is judged on the other half, and the
+set on half of the places: 15 % above its largest value on clean images, or the geometric mean of that
+and the 5 % quantile of distorted ones where this is larger. It is judged on the other half, and the
 halves are exchanged. *Named* is the share of distorted images that have the finding at the limits of the
 code. Five minutes.
 Run: python -m benchmarks.pixel_checks
