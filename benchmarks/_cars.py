@@ -5,6 +5,7 @@ gives the command.
 """
 
 import json
+import os
 import resource
 import subprocess
 import tempfile
@@ -74,6 +75,7 @@ def cars_surface(command: str, images: dict[Path, Path], grid: MapGrid) -> Made:
                 timeout=MOST_S,
                 stdout=log,
                 stderr=log,
+                env={name: value for name, value in os.environ.items() if name != "NUMBA_NUM_THREADS"},
             )
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         cpu_s = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime

@@ -84,18 +84,22 @@ class CoarseHeights:
         known = [np.concatenate(parts) if parts else np.empty(0) for parts in off_m]
         return np.array([np.median(values) if len(values) else np.nan for values in known])
 
-    def agreement(self, within_m: float) -> Array:
+    def agreement(self, within_m: Array) -> Array:
         """Share (p,) of the cells where each pair was matched in which it agrees with the median of all.
 
         Cells that no pair has do not count.
+
+        Args:
+            within_m: (p,) distance up to which each pair agrees.
         """
         agree, seen = np.zeros(len(self.pairs)), np.zeros(len(self.pairs))
         for row in range(len(self.windows)):
             found = list(self._found(row))
             middle = _middle([heights for _, heights, _ in found])
             for number, heights, looked_at in found:
+                off_m = np.abs(heights - self.offset_m[number] - middle)
                 seen[number] += (looked_at & np.isfinite(middle)).sum()
-                agree[number] += (np.abs(heights - self.offset_m[number] - middle) < within_m).sum()
+                agree[number] += (off_m < within_m[number]).sum()
         return agree / np.maximum(seen, 1)
 
     def around(self, tile: MapGrid) -> tuple[float, float] | None:

@@ -13,7 +13,7 @@ from amers.services.map_grid import MapGrid
 from amers.services.surface.coarse import AGREES_CELLS, CoarseSearch
 from amers.services.surface.match import Reasons
 from amers.services.surface.options import SurfaceOptions
-from amers.services.surface.pairs import LEAST_SHOWN, Pair, candidate_pairs, pairs_over
+from amers.services.surface.pairs import BEST_BASE, LEAST_SHOWN, Pair, candidate_pairs, pairs_over
 from amers.services.surface.stages import Stages, fuse_task
 from amers.services.surface.tiles import (
     LARGEST_TILE,
@@ -104,7 +104,9 @@ def make_surface(
     grid = grid or grid_over(scenes, candidates, options.gsd_m)
     search = CoarseSearch(scenes, candidates, heights_m, options)
     coarse = search.over(grid, windows, work, part_of(progress, 0.0, 0.2))
-    agreement = coarse.agreement(AGREES_CELLS * float(grid.step_xy[0, 1]))
+    # What is within the noise of a pair agrees: that of a smaller base is as much larger.
+    noisier = np.array([max(1.0, BEST_BASE / pair.base_to_height) for pair in candidates])
+    agreement = coarse.agreement(AGREES_CELLS * float(grid.step_xy[0, 1]) * noisier)
     shown = [replace(p, merit=float(a)) for p, a in zip(candidates, agreement, strict=True)]
     windows = windows or windows_of(grid.shape, LARGEST_TILE)
     best = pairs_over(shown, grid, windows, options.pairs, LEAST_SHOWN)
