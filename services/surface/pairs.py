@@ -26,7 +26,7 @@ _HALVED_DAYS = 60.0
 _USED_AGAIN = 0.8
 """What an image that another pair uses leaves of the merit of a pair: their noise is not independent."""
 LEAST_SHOWN = 0.85
-"""Share of the merit of the best pair that others need, once coarse pixels have shown it: worse
+"""Share of the fit of the best pair that others need, once coarse pixels have shown it: worse
 ones added noise to surfaces of four to ten pairs against lidar in one town."""
 _LEAST_OVERLAP = 0.02
 """Share of the smaller image that both have to show."""
@@ -41,7 +41,8 @@ class Pair:
         base_to_height: distance of the sensors over their height, as the rays meet on the ground.
         days: between the images; NaN when unknown.
         overlap: outline (m, 2) of the ground that both show, lon and lat, not closed.
-        merit: of the pair, 1 at best.
+        merit: of the pair, 1 at best: those with the largest are used.
+        fit: share of the ground where it agrees with others within its noise; see `choose_pairs`.
     """
 
     first: int
@@ -50,6 +51,7 @@ class Pair:
     days: float
     overlap: Array
     merit: float
+    fit: float = 1.0
 
 
 def candidate_pairs(
@@ -96,12 +98,12 @@ def choose_pairs(candidates: Sequence[Pair], most: int, least: float = 0.0) -> l
     Args:
         candidates: to choose from.
         most: pairs at most.
-        least: share of the merit of the best pair that others need.
+        least: share of the fit of the pair with the largest merit that others need.
     """
     chosen: list[Pair] = []
     used = Counter[int]()
-    best_merit = max(pair.merit for pair in candidates)
-    rest = [pair for pair in candidates if pair.merit >= least * best_merit]
+    best = max(candidates, key=lambda pair: pair.merit)
+    rest = [pair for pair in candidates if pair.fit >= least * best.fit]
     while rest and len(chosen) < most:
         best = max(rest, key=lambda p: p.merit * _USED_AGAIN ** (used[p.first] + used[p.second]))
         rest.remove(best)
@@ -124,7 +126,7 @@ def pairs_over(
         grid: of the windows.
         windows: parts of it.
         most: pairs at most of one window.
-        least: share of the merit of the best pair of a window that others need there.
+        least: share of the fit of the best pair of a window that others need there.
     """
     tree = shapely.STRtree([shapely.Polygon(grid.line_sample(pair.overlap)) for pair in candidates])
     chosen = []

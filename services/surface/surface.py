@@ -106,8 +106,11 @@ def make_surface(
     coarse = search.over(grid, windows, work, part_of(progress, 0.0, 0.2))
     # What is within the noise of a pair agrees: that of a smaller base is as much larger.
     noisier = np.array([max(1.0, BEST_BASE / pair.base_to_height) for pair in candidates])
-    agreement = coarse.agreement(AGREES_CELLS * float(grid.step_xy[0, 1]) * noisier)
-    shown = [replace(p, merit=float(a)) for p, a in zip(candidates, agreement, strict=True)]
+    fits = coarse.agreement(AGREES_CELLS * float(grid.step_xy[0, 1]) * noisier)
+    shown = [
+        replace(pair, merit=float(fit / noise), fit=float(fit))
+        for pair, fit, noise in zip(candidates, fits, noisier, strict=True)
+    ]
     windows = windows or windows_of(grid.shape, LARGEST_TILE)
     best = pairs_over(shown, grid, windows, options.pairs, LEAST_SHOWN)
     used = sorted({number for numbers in best for number in numbers})

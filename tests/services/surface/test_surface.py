@@ -99,7 +99,7 @@ def test_pairs_are_chosen_by_angle_and_spread_over_the_images() -> None:
     assert bases == [0.25, 0.25, 0.5]
     best = choose_pairs(candidates, 3)[0]
     assert {best.first, best.second} == {0, 1}
-    weak = [replace(candidates[0], merit=0.9), replace(candidates[1], merit=0.3)]
+    weak = [replace(candidates[0], fit=0.9), replace(candidates[1], fit=0.3)]
     assert choose_pairs(weak, 2, 0.5) == weak[:1]
     with pytest.raises(CoverageError, match=r"base over height of 0.6 to 0.9; .*left and right: 0.50"):
         candidate_pairs(scenes, HEIGHTS_M, (0.6, 0.9))
