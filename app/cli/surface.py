@@ -27,7 +27,7 @@ class MadeOptions:
     """How the surface is made.
 
     Attributes:
-        gsd_m: side of a cell, metres; by default the ground sampling of the finest image.
+        gsd_m: side of a cell, metres; by default the ground sampling of the finest image in two digits.
         heights_m: lowest and highest surface above the ellipsoid: LOW,HIGH, metres; by default the
             heights that the models are meant for.
         pairs: number of pairs of images at most.

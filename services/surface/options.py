@@ -13,7 +13,8 @@ class SurfaceOptions:
     """How a surface is made.
 
     Attributes:
-        gsd_m: side of a cell, metres; None takes the ground sampling of the finest image.
+        gsd_m: side of a cell, metres; None takes the ground sampling of the finest image in two
+            digits.
         heights_m: lowest and highest surface above the ellipsoid, metres; None takes the heights that
             the models are meant for.
         pairs: number of pairs at most.

@@ -51,9 +51,10 @@ def grid_over(scenes: Sequence[Scene], pairs: Sequence[Pair], gsd_m: float | Non
     Args:
         scenes: of the pairs.
         pairs: of them.
-        gsd_m: side of a cell; None takes the ground sampling of the finest image.
+        gsd_m: side of a cell; None takes the ground sampling of the finest image in two digits.
     """
-    side_m = gsd_m or min(scene_gsd_m(scenes[pair.first]) for pair in pairs)
+    finest_m = min(scene_gsd_m(scenes[pair.first]) for pair in pairs)
+    side_m = gsd_m or float(f"{finest_m:.2g}")
     outline = np.concatenate([pair.overlap for pair in pairs])
     lon, lat = outline.mean(axis=0)
     crs = utm_of((lon + 180.0) % 360.0 - 180.0, lat)
