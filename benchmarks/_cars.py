@@ -42,8 +42,8 @@ class Made:
     memory_mib: float
 
 
-def cars_surface(command: str, images: dict[Path, Path], grid: MapGrid) -> Made:
-    """The surface of all pairs of some images.
+def cars_surface(command: str, images: dict[Path, Path], grid: MapGrid) -> Made | None:
+    """The surface of all pairs of some images; None, and its last words printed, where the run failed.
 
     Args:
         command: that runs CARS.
@@ -51,7 +51,7 @@ def cars_surface(command: str, images: dict[Path, Path], grid: MapGrid) -> Made:
         grid: the cells that heights are wanted in.
 
     Raises:
-        CalledProcessError, TimeoutExpired: the run failed or took too long.
+        TimeoutExpired: the run took too long.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -69,14 +69,18 @@ def cars_surface(command: str, images: dict[Path, Path], grid: MapGrid) -> Made:
         (folder / "settings.json").write_text(json.dumps(settings))
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         with (folder / "log.txt").open("wb") as log:
-            subprocess.run(
+            done = subprocess.run(
                 [command, str(folder / "settings.json")],
-                check=True,
+                check=False,
                 timeout=MOST_S,
                 stdout=log,
                 stderr=log,
                 env={name: value for name, value in os.environ.items() if name != "NUMBA_NUM_THREADS"},
             )
+        if done.returncode != 0:
+            last = (folder / "log.txt").read_text(errors="replace").splitlines()[-30:]
+            print("\n".join(["CARS failed:", *last]))
+            return None
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         cpu_s = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
         return Made(_heights(folder / "out" / "dsm" / "dsm.tif", grid), cpu_s, after.ru_maxrss / 1024.0)

@@ -89,11 +89,13 @@ def outcome(folder: Path, block: Path, name: str, fill_cells: int) -> Outcome:
     return judged(name, made, len(surface.pairs), (heights, sigmas, truth), took)
 
 
-def peer(folder: Path, block: Path, name: str, command: str) -> Outcome:
-    """The surface that CARS makes of one set of scenes, which states no sigmas."""
+def peer(folder: Path, block: Path, name: str, command: str) -> Outcome | None:
+    """The surface that CARS makes of one set of scenes, which states no sigmas; None where it fails."""
     images = images_of(folder, block, name)
     truth, grid = truth_of(folder, name)
     made = cars_surface(command, images, grid)
+    if made is None:
+        return None
     count = len(images) * (len(images) - 1) // 2
     heights = (made.heights, np.full(grid.shape, np.nan, dtype=np.float32), truth)
     return judged(name, "CARS", count, heights, (made.cpu_s, made.memory_mib))
@@ -208,7 +210,8 @@ def main() -> None:
         for cells in (0, SurfaceOptions().fill_cells):
             outcomes.append(outcome(folder, block, name, cells))
         if arguments.cars and len(SETS[name][1]) <= LARGEST_OF_PEER:
-            outcomes.append(peer(folder, block, name, arguments.cars))
+            other = peer(folder, block, name, arguments.cars)
+            outcomes += [other] if other else []
     keep("surface", [asdict(one) for one in outcomes])
     print_table(
         "Surfaces",

@@ -39,6 +39,7 @@ READERS: tuple[Reader, ...] = (
 
 OWN_FILES = frozenset(
     {
+        "open_surface",
         "parse_block_json",
         "parse_chip_header",
         "parse_correction",

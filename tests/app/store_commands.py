@@ -44,7 +44,11 @@ from tests.factories import make_block
 Words = tuple[object, ...]
 BOX = ",".join(f"{value:.4f}" for value in (*(CENTRE - 0.1), *(CENTRE + 0.1)))
 WITHOUT_STORE = {
+    "scene mosaic",
     "scene ortho",
+    "surface difference",
+    "surface make",
+    "surface points",
     "vectors canvas",
     "vectors correct",
     "vectors project",
