@@ -120,13 +120,13 @@ UNKNOWN_FRAME = Frame(np.full((3, 3), np.nan))
 
 @dataclass(frozen=True)
 class SurfaceHeights:
-    """The surface at the centres of the chips of n points: a statement for elevation models.
+    """The surface at the places of n points: a statement for elevation models and other tools.
 
     The height of a point itself is that of the content of its chip, which registration searches.
 
     Attributes:
-        height_m: (n,) above the ellipsoid, in the frame of the point's block, where the line of sight of
-            the point's steepest view meets the surface; NaN when unknown.
+        height_m: (n,) above the ellipsoid, in the frame of the point's block, of what stands at its
+            longitude and latitude; NaN when unknown.
         sigma_m: (n,) one standard deviation; NaN when unknown.
     """
 

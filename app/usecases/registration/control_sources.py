@@ -1,9 +1,10 @@
 """Sources of control points for a scene: a block folder, or the published blocks of the store."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from amers.app.db.blocks import find_surface_heights
 from amers.app.db.engine import Database
 from amers.app.db.points import control_points
 from amers.app.storage import Storage
@@ -51,7 +52,9 @@ def points_of_store(database: Database, storage: Storage) -> FindPoints:
     def find(outline: Array) -> ControlSet:
         with database.snapshot() as connection:
             stored = control_points(connection, outline)
+            surface = find_surface_heights(connection, stored.points.id)
+        points = replace(stored.points, surface=surface)
         blocks = tuple(BlockUsed(block.id, block.version) for block in stored.blocks)
-        return ControlSet(stored.points, open_chips(database, storage), blocks)
+        return ControlSet(points, open_chips(database, storage), blocks)
 
     return find

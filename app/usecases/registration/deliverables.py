@@ -6,14 +6,15 @@ import numpy as np
 
 from amers.app.usecases.report_files import write_report, write_texts
 from amers.services.formats.gcp.json_formats import format_measures, format_opf
-from amers.services.formats.gcp.marked_points import marked_points
+from amers.services.formats.gcp.marked_points import MarkedPoints, marked_points
 from amers.services.formats.gcp.odm import format_gcp_list
 from amers.services.formats.gcp.pci import format_pci_text
 from amers.services.formats.gcp.text_formats import format_asp_gcp, format_envi_pts, format_qgis_points
 from amers.services.formats.vector.residual_layers import exaggeration_for, write_residual_layers
 from amers.services.reports.registration_pages import REGISTRATION_PAGE
 from amers.services.reports.report import RegistrationReport
-from amers.services.types import Array, ControlPoints, Measures
+from amers.services.sensors.base import SensorModel
+from amers.services.types import Array, ControlPoints, IntArray, Measures
 
 OUTPUTS = {
     "report.json": "The report as a document.",
@@ -37,7 +38,11 @@ TITLES = {**OUTPUTS, "attitude.csv": "Roll and pitch over time of a rigorous mod
 
 
 def write_outputs(
-    folder: Path, report: RegistrationReport, image: str, points: ControlPoints
+    folder: Path,
+    report: RegistrationReport,
+    image: str,
+    points: ControlPoints,
+    model: SensorModel,
 ) -> dict[str, Path]:
     """Write the report and the control points of a registration; returns the files by name.
 
@@ -45,31 +50,54 @@ def write_outputs(
         folder: created when missing; files of the same names are replaced.
         report: of the registration.
         image: file name of the scene, which the control points refer to.
-        points: the control points of the registration, for their precision.
+        points: the control points of the registration, for their precision and their surface.
+        model: of the scene, refined.
     """
     measures = report.figure_data.measures
     sigma_m = _point_sigmas_m(points, measures)
+    marks = _marks(measures, sigma_m, points, image, model)
     files = write_report(folder, REGISTRATION_PAGE, report)
     geojson = format_measures(measures, image, sigma_m)
-    texts = {"control_points.geojson": geojson, **_exchange_formats(measures, image, sigma_m)}
+    texts = {"control_points.geojson": geojson, **_exchange_formats(marks)}
     layers = folder / "residuals.gpkg"
     write_residual_layers(layers, measures, image, exaggeration_for(measures))
     return {**files, **write_texts(folder, texts), layers.name: layers}
 
 
-def _exchange_formats(measures: Measures, image: str, sigma_m: Array) -> dict[str, str]:
-    """The matched points in the formats of other tools, by file name."""
+def _marks(
+    measures: Measures, sigma_m: Array, points: ControlPoints, image: str, model: SensorModel
+) -> MarkedPoints:
+    """The matched points where the scene shows the surface at them, where it is known.
+
+    The height at which chips are found is that of their whole content. Other tools take a mark for a
+    place on the ground: it gets the height of the surface, and moves in the image by the parallax
+    between both heights, so that its residual stays.
+    """
     matched = np.flatnonzero(measures.matched)
-    marks = marked_points(
+    lon_lat_h, line_sample = measures.lon_lat_h[matched], measures.line_sample[matched]
+    sigma_m = sigma_m[matched]
+    if points.surface is not None:
+        rows = _rows(points, measures)[matched]
+        height_m = points.surface.height_m[rows]
+        known = np.isfinite(height_m)
+        before = model.project(lon_lat_h[known])
+        lon_lat_h[known, 2] = height_m[known]
+        line_sample[known] += model.project(lon_lat_h[known]) - before
+        sigma_m[known, 2] = points.surface.sigma_m[rows][known]
+    return marked_points(
         [str(point) for point in measures.point_id[matched]],
-        measures.lon_lat_h[matched],
-        measures.line_sample[matched],
-        sigma_m=sigma_m[matched],
+        lon_lat_h,
+        line_sample,
+        sigma_m=sigma_m,
         image=[image] * len(matched),
         sigma_px=measures.sigma_px[matched],
         residual_px=measures.residual_px[matched],
         active=measures.active[matched],
     )
+
+
+def _exchange_formats(marks: MarkedPoints) -> dict[str, str]:
+    """Marks in the formats of other tools, by file name."""
     return {
         "control_points.gcp": format_asp_gcp(marks),
         "control_points.points": format_qgis_points(marks),
@@ -82,6 +110,10 @@ def _exchange_formats(measures: Measures, image: str, sigma_m: Array) -> dict[st
 
 def _point_sigmas_m(points: ControlPoints, measures: Measures) -> Array:
     """Sigmas (n, 3) of the points of the measures, east, north, up."""
+    return np.sqrt(np.diagonal(points.covariance_m2[_rows(points, measures)], axis1=1, axis2=2))
+
+
+def _rows(points: ControlPoints, measures: Measures) -> IntArray:
+    """Row (n,) of the point of each measure."""
     order = np.argsort(points.id)
-    rows = order[np.searchsorted(points.id, measures.point_id, sorter=order)]
-    return np.sqrt(np.diagonal(points.covariance_m2[rows], axis1=1, axis2=2))
+    return np.asarray(order[np.searchsorted(points.id, measures.point_id, sorter=order)])

@@ -240,7 +240,7 @@ def write_registered(
         checks=checks,
         nearest_px=None if rigorous is None else rigorous.correction_error_px,
     )
-    outputs = write_outputs(folder, report, files.image.name, control.points)
+    outputs = write_outputs(folder, report, files.image.name, control.points, registration.model)
     outputs.update({path.name: path for path in refined.files})
     return RegisteredScene(registration, None, report, outputs)
 
