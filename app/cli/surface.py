@@ -60,8 +60,9 @@ def make(
     """Make the surface that overlapping registered scenes show: heights with their accuracy, on a map.
 
     The file has four bands: height above the ellipsoid and its standard deviation in metres, number of
-    images, and a number for the reason why a cell has no height. The models of the scenes have to agree:
-    register them together first (--registered), or give the block that was made from them (--block).
+    images, and a number for the reason why a cell has no height. A page beside it, with the ending html,
+    shows it. The models of the scenes have to agree: register them together first (--registered), or
+    give the block that was made from them (--block).
     """
     with shown_progress() as progress:
         surface = run_surface(
@@ -117,8 +118,9 @@ def difference(
     """Compare two surfaces: what rose and what sank, with its accuracy, on a map.
 
     The file has three bands: height of the later above the earlier surface, its standard deviation, and
-    their ratio. The shift of the later surface by which both agree on most ground is told; without it
-    (--no-align), a common error of all heights is a difference too.
+    their ratio. A page beside it, with the ending html, shows it. The shift of the later surface by
+    which both agree on most ground is told; without it (--no-align), a common error of all heights is a
+    difference too.
     """
     with shown_progress() as progress:
         found = write_surface_difference(earlier, later, output, align=align, progress=progress)

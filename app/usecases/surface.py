@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,13 +17,18 @@ from amers.app.errors import InputError
 from amers.app.usecases.executors import open_executor
 from amers.app.usecases.image_production import WorkPlace
 from amers.app.usecases.registered_scene import SceneModel, adjusted_model, read_registered_scene
+from amers.app.usecases.report_files import write_texts
+from amers.services.datums import horizontal
 from amers.services.formats.images.ortho import BandForm, write_cog
 from amers.services.formats.images.scenes import read_scene
-from amers.services.formats.images.surfaces import BANDS, heights_crs
+from amers.services.formats.images.surfaces import BANDS, heights_crs, read_reduced
 from amers.services.formats.work_folder import WorkFolder
 from amers.services.imagery.scene import Scene
 from amers.services.map_grid import MapGrid
 from amers.services.orthorectification.rectify import OrthoWindow
+from amers.services.reports.html import format_html
+from amers.services.reports.surface import SHOWN_CELLS, ReducedMap, SurfaceReport, UsedPair
+from amers.services.reports.surface_pages import SURFACE_PAGE
 from amers.services.sensors.correction import CorrectedModel
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.statements import Statements, gathered
@@ -70,6 +76,7 @@ class SurfaceFile:
 
     Attributes:
         path: of the GeoTIFF.
+        report: page that shows it, beside it.
         crs: of its map, with heights above the ellipsoid.
         lines, samples: its size.
         gsd_m: side of a cell, metres.
@@ -82,6 +89,7 @@ class SurfaceFile:
     """
 
     path: Path
+    report: Path
     crs: str
     lines: int
     samples: int
@@ -114,7 +122,8 @@ def run_surface(
 
     Args:
         files: of the scenes.
-        output: the file; an existing one is replaced when the new one is complete.
+        output: the file; an existing one is replaced when the new one is complete. A page that shows it,
+            of the same name with the ending html, is written beside it.
         options: of the surface.
         place: where the work is done. Without a folder of its own, results of tasks are kept next to the
             output until the file is complete, so that an interrupted work continues.
@@ -189,8 +198,9 @@ def write_surface(
     if place.folder is None:
         shutil.rmtree(folder)
     lines, samples = surface.grid.shape
-    return SurfaceFile(
+    written = SurfaceFile(
         output,
+        output.with_suffix(".html"),
         surface.grid.crs,
         lines,
         samples,
@@ -201,6 +211,27 @@ def write_surface(
         dict(work.effort),
         gathered(one for scene in opened for one in scene.statements),
     )
+    _write_report(written)
+    return written
+
+
+def reduced_map(path: Path, shape: tuple[int, int], gsd_m: float) -> ReducedMap:
+    """A map in a file as its report shows it."""
+    return ReducedMap(path.name, shape, gsd_m, *read_reduced(path, SHOWN_CELLS))
+
+
+def _write_report(surface: SurfaceFile) -> None:
+    report = SurfaceReport(
+        reduced_map(surface.path, (surface.lines, surface.samples), surface.gsd_m),
+        horizontal(surface.crs).name,
+        tuple(UsedPair(**pair) for pair in surface.pairs),
+        surface.cells,
+        surface.sigma_m,
+        surface.statements,
+        datetime.now(UTC),
+        version("amers"),
+    )
+    write_texts(surface.report.parent, {surface.report.name: format_html(SURFACE_PAGE, report)})
 
 
 @dataclass

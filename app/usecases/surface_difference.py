@@ -4,15 +4,23 @@ import math
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
 from amers.app.errors import InputError
+from amers.app.usecases.report_files import write_texts
+from amers.app.usecases.surface import reduced_map
+from amers.services.datums import horizontal
 from amers.services.errors import CoverageError
 from amers.services.formats.images.ortho import BandForm, write_cog
 from amers.services.formats.images.surfaces import open_surface
 from amers.services.orthorectification.rectify import OrthoWindow
+from amers.services.reports.html import format_html
+from amers.services.reports.surface import DifferenceReport
+from amers.services.reports.surface_pages import DIFFERENCE_PAGE
 from amers.services.surface.difference import Alignment, DifferenceTile, TwoSurfaces
 from amers.services.types import FloatImage, Progress, no_progress, part_of
 
@@ -29,6 +37,7 @@ class SurfaceDifference:
 
     Attributes:
         path: of the GeoTIFF.
+        report: page that shows it, beside it.
         crs: of its map.
         lines, samples: its size.
         gsd_m: side of a cell, metres.
@@ -45,6 +54,7 @@ class SurfaceDifference:
     """
 
     path: Path
+    report: Path
     crs: str
     lines: int
     samples: int
@@ -95,7 +105,8 @@ def write_surface_difference(
 
     Args:
         earlier, later: as `amers surface make` writes them.
-        output: the GeoTIFF; an existing one is replaced when the new one is complete.
+        output: the GeoTIFF; an existing one is replaced when the new one is complete. A page that shows
+            it, of the same name with the ending html, is written beside it.
         align: move the later surface onto the earlier one first, in position and height.
         progress: receives the fraction done and a message.
 
@@ -127,8 +138,9 @@ def write_surface_difference(
         )
     difference_m, significance = np.concatenate(counted.thinned, axis=1)
     median_m = float(np.median(difference_m))
-    return SurfaceDifference(
+    found = SurfaceDifference(
         output,
+        output.with_suffix(".html"),
         grid.crs,
         lines,
         samples,
@@ -143,3 +155,26 @@ def write_surface_difference(
         1.4826 * float(np.median(np.abs(significance))),
         counted.changed / counted.known,
     )
+    _write_report(found, earlier.name, later.name)
+    return found
+
+
+def _write_report(found: SurfaceDifference, earlier: str, later: str) -> None:
+    report = DifferenceReport(
+        reduced_map(found.path, (found.lines, found.samples), found.gsd_m),
+        horizontal(found.crs).name,
+        earlier,
+        later,
+        found.shift_m,
+        found.shift_sigma_m,
+        found.aligned_cells,
+        found.moved_horizontally,
+        found.known,
+        found.median_m,
+        found.nmad_m,
+        found.spread,
+        found.changed,
+        datetime.now(UTC),
+        version("amers"),
+    )
+    write_texts(found.report.parent, {found.report.name: format_html(DIFFERENCE_PAGE, report)})

@@ -43,7 +43,7 @@ from amers.services.formats.images.surfaces import BANDS
 from amers.services.surface.options import MOST_FILL_CELLS, SurfaceOptions
 from amers.services.surface.surface import surface_grid
 
-SURFACE_NAME = "surface.tif"
+SURFACE_NAME, REPORT_NAME = "surface.tif", "report.html"
 MOST_PAIRS = 100
 """Pairs of one job at most: each is matched over all the ground that it shows."""
 _CELL_BYTES = 4 * len(BANDS)
@@ -153,7 +153,7 @@ def _run(work: Work) -> Commit:
             place=WorkPlace(kept / hashlib.sha256(facts.encode()).hexdigest()),
             progress=work.progress,
         )
-        files = store_results(work, {SURFACE_NAME: surface.path})
+        files = store_results(work, {SURFACE_NAME: surface.path, REPORT_NAME: surface.report})
 
     def commit(connection: Connection) -> dict[str, Any]:
         return {
@@ -196,7 +196,8 @@ MAKE_SURFACE = Process(
     outputs={
         SURFACE_NAME: "The surface, a cloud-optimised GeoTIFF with four bands: height above the "
         "ellipsoid and its standard deviation in metres, number of images, and a number for the reason "
-        "why a cell has no height."
+        "why a cell has no height.",
+        REPORT_NAME: "A page that shows it: heights, accuracy, pairs of scenes, empty cells by reason.",
     },
     check=_check,
     run=_run,

@@ -98,6 +98,15 @@ def test_the_command_tells_pairs_and_cells(images: tuple[Path, ...], tmp_path: P
     record = json.loads(done.stdout)
     assert record["pairs"][0]["base_to_height"] == pytest.approx(0.5, abs=0.01)
     assert record["cells"]["has a height"] > 10_000
+    page = Path(record["report"]).read_text(encoding="utf-8")
+    assert Path(record["report"]) == tmp_path / "surface.html"
+    assert page.count("<svg viewBox") == 2
+    assert f"{record['sigma_m']:.2f} m" in page
+    assert "left + right" in page or "right + left" in page
+    for label, count in record["cells"].items():
+        assert label in page
+        assert f"{count:,}" in page
+    assert "m above the ellipsoid" in page
 
 
 def centre_height_m(surface: Path) -> float:

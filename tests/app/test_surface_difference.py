@@ -98,6 +98,12 @@ def test_the_shift_is_found_and_the_house_is_what_changed(tmp_path: Path) -> Non
     # Bilinear interpolation makes the noise of one of them smaller.
     assert SIGMA_M < found["nmad_m"] <= 2.0**0.5 * SIGMA_M * 1.02
     assert 0.7 < found["spread"] < 1.05
+    page = (tmp_path / "d.html").read_text(encoding="utf-8")
+    assert found["report"] == str(tmp_path / "d.html")
+    assert "later.tif less earlier.tif" in page
+    for shift_m, sigma_m in zip(found["shift_m"], found["shift_sigma_m"], strict=True):
+        assert f"<td>{shift_m:.3f}</td><td>{sigma_m:.3f}</td>" in page
+    assert page.count("<svg viewBox") == 2
     with rasterio.open(tmp_path / "d.tif") as file:
         assert file.descriptions == DIFFERENCE_BANDS
         difference_m, sigma_m, significance = file.read()
@@ -132,6 +138,7 @@ def test_without_alignment_all_of_a_shift_is_a_difference(tmp_path: Path) -> Non
     found = write_surface_difference(earlier, later, tmp_path / "d.tif", align=False)
     assert (found.shift_m, found.aligned_cells) == ((0.0, 0.0, 0.0), 0)
     assert found.median_m == pytest.approx(-SHIFT_M[2], abs=0.2)
+    assert "was not moved (--no-align)" in found.report.read_text(encoding="utf-8")
 
 
 def test_flat_ground_tells_no_position(tmp_path: Path) -> None:
@@ -141,6 +148,7 @@ def test_flat_ground_tells_no_position(tmp_path: Path) -> None:
     assert not found.moved_horizontally
     assert found.shift_m[:2] == (0.0, 0.0)
     assert found.shift_m[2] == pytest.approx(SHIFT_M[2], abs=two_centimetres)
+    assert "too flat to tell a shift east and north" in found.report.read_text(encoding="utf-8")
 
 
 def test_surfaces_apart_and_outputs_over_inputs_are_refused(tmp_path: Path) -> None:

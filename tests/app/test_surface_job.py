@@ -90,6 +90,9 @@ def test_a_job_makes_the_surface_of_registered_scenes(
     served = me.get(results["surface.tif"]["href"])
     assert served.headers["content-type"].startswith("image/tiff")
     (tmp_path / "served.tif").write_bytes(served.content)
+    page = me.get(results["report.html"]["href"])
+    assert page.headers["content-type"].startswith("text/html")
+    assert f"{ids[0]} + {ids[1]}" in page.text
     files = SurfaceFiles((folder / "left.tif", folder / "right.tif"), folder / "registered")
     own = run_surface(files, tmp_path / "own.tif", OPTIONS, place=WorkPlace())
     assert (tmp_path / "served.tif").read_bytes() == (tmp_path / "own.tif").read_bytes()

@@ -7,14 +7,17 @@ from types import TracebackType
 from typing import Self
 
 import numpy as np
+import rasterio
 from pyproj import CRS
 
 from amers.services.errors import FormatError
 from amers.services.formats.images.bands import one_band
+from amers.services.formats.images.datasets import GDAL_CACHE, as_format_error
 from amers.services.formats.images.raster import RasterImage, map_grid_of, open_raster
 from amers.services.imagery.source import Window
 from amers.services.map_grid import MapGrid
 from amers.services.surface.surface import SurfaceTile
+from amers.services.types import FloatImage
 
 BANDS = ("height_m", "sigma_m", "views", "reason")
 """Bands of the file of a surface."""
@@ -84,3 +87,34 @@ def open_surface(path: Path) -> SurfaceImage:
             raise FormatError(f"{path}: {horizontal.name} found, a projected map in metres expected")
         stack.pop_all()
     return SurfaceImage(image, replace(grid, crs=horizontal.to_wkt("WKT2_2019")))
+
+
+def read_reduced(path: Path, most_cells: int) -> tuple[FloatImage, MapGrid]:
+    """All bands of a GeoTIFF on a map with fewer cells, each the nearest value in the file.
+
+    Args:
+        path: as `write_cog` writes it, whose overviews make this fast.
+        most_cells: of the longer side.
+
+    Returns:
+        (bands, lines, samples) values, and the grid of these cells.
+
+    Raises:
+        FormatError: the file cannot be read, or has no map.
+    """
+    image = open_raster(path)
+    try:
+        grid = map_grid_of(image)
+        if grid is None:
+            raise FormatError(f"{path}: no reference system found, an image on a map expected")
+        reduction = max(1.0, max(grid.shape) / most_cells)
+        lines, samples = (max(1, round(side / reduction)) for side in grid.shape)
+        with as_format_error(path, "readable pixels"), rasterio.Env(**GDAL_CACHE):
+            bands = image.dataset.read(out_shape=(image.dataset.count, lines, samples))
+    finally:
+        image.close()
+    factors = np.array(grid.shape) / [lines, samples]
+    origin_xy = grid.xy((factors[None, :] - 1.0) / 2.0)[0]
+    return bands, replace(
+        grid, origin_xy=origin_xy, step_xy=grid.step_xy * factors, shape=(lines, samples)
+    )
