@@ -53,8 +53,13 @@ COMMANDS: Tree = {
         },
     ),
     "points": Group(
-        "Control points of published blocks: query, suspend, reinstate.",
+        "Points: those of published blocks, and ground coordinates of marks in images.",
         {
+            "intersect": Command(
+                "point_intersection:intersect",
+                "Compute ground coordinates, with their accuracy, of points that are marked in several "
+                "images.",
+            ),
             "query": Command(
                 "point_query:query",
                 "Write all points of a box; --json without --output prints only their number.",

@@ -65,7 +65,7 @@ def read_marked(
         marks = _control_marks(read, path)
         unstated += missing
         if not missing:
-            image.append(_images_of(marks, path, scenes, images))
+            image.append(images_of_marks(marks, path, scenes, images))
         names += [f"{path.name}:{name}" for name in marks.id]
         if points.sigma_m is not None:
             sigma_m = filled_sigmas(marks.sigma_m, points.sigma_m, marks.datum_sigma_m)
@@ -120,7 +120,7 @@ def _control_marks(points: MarkedPoints, path: Path) -> MarkedPoints:
     return control.take(control.is_marked)
 
 
-def _images_of(
+def images_of_marks(
     marks: MarkedPoints, path: Path, scenes: Sequence[Scene], images: Sequence[FilePlace]
 ) -> IntArray:
     """The image (m,) of every mark, by its name, or that of the file where it names none.
@@ -144,7 +144,7 @@ def _images_of(
     if unknown:
         known = sorted(scene.acquisition.image_id for scene in scenes)
         raise InputError(
-            f"{path.name}: marks in {_some(unknown)}, expected names of the images of the block: "
+            f"{path.name}: marks in {_some(unknown)}, expected names of the images given: "
             f"{_some(known)}; give these images, or leave their marks out"
         )
     number = np.array([min(of_name[name]) for name in names.tolist()], dtype=np.int64)

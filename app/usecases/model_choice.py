@@ -34,8 +34,8 @@ class ModelChoice:
         Raises:
             InputError: a file does not exist, a value has another form, or it is of no image.
         """
-        files = _by_image("--model", self.model, images)
-        origins = _by_image("--crop-origin", self.crop_origin, images)
+        files = by_image("--model", self.model, images)
+        origins = by_image("--crop-origin", self.crop_origin, images)
         for text in files.values():
             if not Path(text).is_file():
                 raise InputError(f"--model: {text}: no such file; the file of a model expected")
@@ -60,7 +60,7 @@ def parse_crop_origin(text: str, source: str = "--crop-origin") -> CropOrigin:
     return float(found[1]), float(found[2])
 
 
-def _by_image(option: str, values: Iterable[str], images: Sequence[Path]) -> dict[Path, str]:
+def by_image(option: str, values: Iterable[str], images: Sequence[Path]) -> dict[Path, str]:
     """The values of an option by their images: FILE of the only image, IMAGE=FILE of one of several."""
     found: dict[Path, str] = {}
     for value in values:

@@ -65,6 +65,7 @@ the corner is (0, 0), the centre is (1, 1), the corner is (1, 1)."""
 _ORIGIN = re.compile(r"\bpixel-origin\s*[=:]\s*(\S+)", re.IGNORECASE)
 """What a line before the names may state: `# pixel-origin=corner crs=EPSG:32633 heights=EGM96`."""
 _POSITIONS = ({"lon", "lat"}, {"x", "y"})
+_MARK = {"line", "sample"}
 _POSITION_NAMES = ("lon", "lat", "x", "y")
 _FLAGS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
 
@@ -76,10 +77,12 @@ class CsvLayout:
     Attributes:
         columns: name of the file's column for names of `COLUMNS`; the others have their own name.
         crs: reference system of x and y, a code or a definition, where the file states none.
+        may_lack_ground: whether marks may come without a position on the ground, in any or all rows.
     """
 
     columns: dict[str, str]
     crs: str | None = None
+    may_lack_ground: bool = False
 
 
 def parse_columns(text: str) -> dict[str, str]:
@@ -101,13 +104,18 @@ def parse_columns(text: str) -> dict[str, str]:
 
 
 def is_csv(text: str, layout: CsvLayout) -> bool:
-    """Whether the first line of a text, after comments, names columns of a position."""
+    """Whether the first line of a text, after comments, names the columns that it has to have."""
     return _names_position(csv_head(text, lambda names: _names_position(names, layout)).names, layout)
 
 
 def _names_position(names: list[str], layout: CsvLayout) -> bool:
     known = {_value_of(name, layout).name for name in names}
-    return any(position <= known for position in _POSITIONS)
+    return any(position <= known for position in _positions(layout))
+
+
+def _positions(layout: CsvLayout) -> tuple[set[str], ...]:
+    """The columns of which a file has to have one set."""
+    return (*_POSITIONS, _MARK) if layout.may_lack_ground else _POSITIONS
 
 
 def lacks_pixel_origin(text: str, layout: CsvLayout) -> bool:
@@ -177,16 +185,24 @@ def parse_csv(
 
 @dataclass(frozen=True)
 class _Columns:
-    """The columns of a file: heads and places of the columns that are read, and the other heads."""
+    """The columns of a file: heads and places of the columns that are read, and the other heads.
+
+    Rows may lack ground where the layout of the caller allows it.
+    """
 
     source: str
     heads: dict[str, Head]
     places: dict[str, int]
     unused: list[tuple[int, Head]]
+    may_lack_ground: bool
 
     @property
     def on_map(self) -> bool:
         return "x" in self.places
+
+    @property
+    def has_ground(self) -> bool:
+        return not self.places.keys().isdisjoint(_POSITION_NAMES)
 
 
 def _value_of(text: str, layout: CsvLayout) -> Head:
@@ -220,11 +236,9 @@ def _columns(
             raise FormatError(f"{where}: found {len(found)} columns {found[0]!r}, expected one")
         if of_name:
             places[name] = (exact or of_name)[0]
-    given = [position for position in _POSITIONS if position <= set(places)]
     is_projected = layout.crs is not None or (comments.crs is not None and comments.crs.is_projected)
-    if len(given) == 2:
-        given = given[1:] if is_projected else given[:1]
-    if len(given) != 1:
+    given = _position_of(set(places), layout, is_projected=is_projected)
+    if given is None:
         raise FormatError(
             f"{where}: expected the columns lon and lat, or x and y, found "
             f"{', '.join(header)[:200]}; name them (--columns lon=COLUMN,lat=COLUMN)"
@@ -232,10 +246,19 @@ def _columns(
     height = _height_place(heads, header, layout, comments.heights or heights, source)
     if height is not None:
         places["height_m"] = height
-    for name in {"lon", "lat", "x", "y"} - given[0]:
+    for name in {"lon", "lat", "x", "y"} - given:
         places.pop(name, None)
     unused = [(place, head) for place, head in enumerate(heads) if place not in places.values()]
-    return _Columns(source, {name: heads[place] for name, place in places.items()}, places, unused)
+    named = {name: heads[place] for name, place in places.items()}
+    return _Columns(source, named, places, unused, layout.may_lack_ground)
+
+
+def _position_of(names: set[str], layout: CsvLayout, *, is_projected: bool) -> set[str] | None:
+    """The columns of the position on the ground; empty where marks have none; None where they miss."""
+    given = [position for position in _POSITIONS if position <= names]
+    if given:
+        return given[-1] if is_projected else given[0]
+    return set() if layout.may_lack_ground and names >= _MARK else None
 
 
 def _height_place(
@@ -324,6 +347,8 @@ def _crs(columns: _Columns, comments: Comments, layout: CsvLayout, record: Recor
         record.not_used(Subject.VERTICAL_DATUM, vertical, "reference system", note)
     if columns.on_map:
         return crs if crs is None else crs.to_2d()
+    if not columns.has_ground:
+        return CRS.from_epsg(4326)
     if crs is None:
         record.assumed(Subject.HORIZONTAL_DATUM, "WGS 84", "", "--crs states another")
         return CRS.from_epsg(4326)
@@ -436,14 +461,23 @@ def _ground(
     heights: Heights | None,
     rows: list[CsvRow],
 ) -> Ground:
-    """Points in WGS 84; points without a height need no vertical datum."""
+    """Points in WGS 84; points without a height need no vertical datum. NaN where ground may lack."""
     names = ("x", "y") if columns.on_map else ("lon", "lat")
     height_m = _column(numbers, "height_m", rows)
-    for x, y, row in zip(numbers[names[0]], numbers[names[1]], rows, strict=True):
+    xy = np.column_stack([_column(numbers, name, rows) for name in names])
+    lacking = np.asarray(np.isnan(xy).all(axis=1) & columns.may_lack_ground)
+    for (x, y), row, is_lacking in zip(xy.tolist(), rows, lacking.tolist(), strict=True):
+        if is_lacking:
+            continue
         if math.isnan(x) or math.isnan(y):
             raise FormatError(f"{row.where}: expected {names[0]} and {names[1]}, found an empty field")
         if not columns.on_map:
             check_lon_lat(x, y, row.where)
-    points = np.column_stack([numbers[names[0]], numbers[names[1]], height_m])
+    points = np.column_stack([xy, height_m])[~lacking]
+    lon_lat_h = np.full((len(rows), 3), np.nan)
+    if lacking.all():
+        return Ground(lon_lat_h, 0.0, ())
     check_axes(points, crs, columns.source)
-    return to_wgs84(points, crs, heights, columns.source)
+    ground = to_wgs84(points, crs, heights, columns.source)
+    lon_lat_h[~lacking] = ground.lon_lat_h
+    return replace(ground, lon_lat_h=lon_lat_h)
