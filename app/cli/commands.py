@@ -60,6 +60,11 @@ COMMANDS: Tree = {
                 "Compute ground coordinates, with their accuracy, of points that are marked in several "
                 "images.",
             ),
+            "experiment": Command(
+                "point_experiment:experiment",
+                "Measure errors of marked points by the number of control points, the images and their "
+                "base.",
+            ),
             "query": Command(
                 "point_query:query",
                 "Write all points of a box; --json without --output prints only their number.",

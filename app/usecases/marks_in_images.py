@@ -21,7 +21,7 @@ from amers.services.imagery.scene import Scene
 from amers.services.quality.check_points import MARKING_SIGMA_PX
 from amers.services.quality.correction_accuracy import CorrectionAccuracy
 from amers.services.quality.frames import weighted_frame
-from amers.services.sensors.parameter_sets import SRP
+from amers.services.sensors.parameter_sets import parameter_set_named
 from amers.services.statements import Statements, gathered
 from amers.services.types import Array, BoolArray, Frame, IntArray, Observations
 
@@ -40,7 +40,8 @@ class MarkedImages:
         registered: folder with the registrations of the images, one folder each, as `amers scene
             register-many -o` writes it.
         block: folder of a block that was made from the images, whose adjusted models are used.
-        rigorous: use the rigorous models of images whose metadata have one, in place of their RPC.
+        rigorous: use the rigorous models of images whose metadata have one, in place of their RPC: srp,
+            toutin or spot-hrv, the parameters that are free where they are adjusted.
         sigma_m: accuracy of a model that is not registered, one sigma, metres; for one of several images
             IMAGE=M, repeat. By default that of the producer or the sensor.
         mark_sigma_px: sigma of marks whose file states none, pixels; by default 0.5.
@@ -52,7 +53,7 @@ class MarkedImages:
     images: tuple[Path, ...]
     registered: Path | None = None
     block: Path | None = None
-    rigorous: bool = False
+    rigorous: str | None = None
     sigma_m: tuple[str, ...] = ()
     mark_sigma_px: float | None = None
     models: ModelChoice = field(default_factory=ModelChoice)
@@ -146,7 +147,7 @@ def _scene(
         return read_registered_scene(SceneModel(image, registration=folder))
     if files.block is not None:
         return read_scene(image, adjusted_model(files.block, image), sigma_m=1.0), None
-    rigorous = SRP if files.rigorous else None
+    rigorous = None if files.rigorous is None else parameter_set_named(files.rigorous)
     sigma_m = _sigmas_m(files).get(image)
     scene = read_scene(image, model, sigma_m=sigma_m, crop_origin=origin, parameter_set=rigorous)
     return scene, None

@@ -45,6 +45,7 @@ Words = tuple[object, ...]
 BOX = ",".join(f"{value:.4f}" for value in (*(CENTRE - 0.1), *(CENTRE + 0.1)))
 WITHOUT_STORE = {
     "scene mosaic",
+    "points experiment",
     "points intersect",
     "scene ortho",
     "surface difference",

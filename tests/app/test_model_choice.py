@@ -57,6 +57,7 @@ def test_a_folder_of_a_product_in_tiles_is_one_scene(tmp_path: Path) -> None:
     [
         "scene register",
         "scene register-many",
+        "points experiment",
         "points intersect",
         "scene ortho",
         "vectors correct",
