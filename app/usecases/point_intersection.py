@@ -28,6 +28,8 @@ from amers.services.types import UNKNOWN_FRAME, Array
 _LAYER = "intersected_points"
 _SCALE_NOTED = 1.5
 """Ratio of residuals to what is stated, or its inverse, that is worth a note."""
+_SCALE_CHANCE = 0.01
+"""A scale that chance explains with a larger probability is not."""
 
 
 @dataclass(frozen=True)
@@ -305,7 +307,8 @@ class _Result:
                 "theirs shows only across the base, and not in which image it is; mark them in a third "
                 "image to find it"
             )
-        if found.scale > _SCALE_NOTED or found.scale < 1.0 / _SCALE_NOTED:
+        is_far = found.scale > _SCALE_NOTED or found.scale < 1.0 / _SCALE_NOTED
+        if is_far and found.scale_chance < _SCALE_CHANCE:
             typical_px = found.scale * float(np.median(read.marks.sigma_px))
             notes.append(
                 f"residuals are {found.scale:.2f} times what is stated of marks and models, which the "

@@ -64,7 +64,8 @@ class IntersectedMarks:
         disagree: (n,) whether two marks disagree, of which nothing shows which one is wrong.
         base_to_height: (n,) largest base over height of two marks.
         shift_px: (k, 2) shifts of the images, within the errors of their models.
-        scale: errors of the marks over what is stated of them; NaN without redundancy.
+        scale: residuals over what is stated of marks and models; NaN without redundancy.
+        freedom: redundant coordinates, from which the scale is.
     """
 
     lon_lat_h: Array
@@ -79,11 +80,20 @@ class IntersectedMarks:
     base_to_height: Array
     shift_px: Array
     scale: float
+    freedom: int
 
     @property
     def found(self) -> BoolArray:
         """Which points (n,) have a position."""
         return np.asarray(np.isfinite(self.lon_lat_h).all(axis=1))
+
+    @property
+    def scale_chance(self) -> float:
+        """Probability of a scale as far from 1, if what is stated is true; NaN without redundancy."""
+        if self.freedom <= 0:
+            return float("nan")
+        below = float(chi2.cdf(self.freedom * self.scale**2, self.freedom))
+        return 2.0 * min(below, 1.0 - below)
 
 
 @dataclass(frozen=True)
@@ -152,6 +162,7 @@ def intersect_marks(
         base_to_height=_base_to_height(models, marks, used, solution.lon_lat_h),
         shift_px=solution.shift_px,
         scale=float(np.sqrt(square / freedom)) if freedom > 0 else float("nan"),
+        freedom=freedom,
     )
 
 

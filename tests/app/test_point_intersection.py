@@ -114,7 +114,8 @@ def test_a_wrong_mark_is_named_with_its_image_in_three_images_and_not_in_two(
     ground = truth(15, rng)
     rows = marks(folder, ground, rng, MODEL_SIGMA_M)
     wrong = rows[NAMES.index("left") * 15 + 4]
-    wrong[2] += 9.0
+    wrong[2] += 6.0
+    wrong[3] += 7.0
     file = table(tmp_path / "marks.csv", rows)
     result = intersect_files(MarkedImages((file,), images(folder), sigma_m=("3",)))
     assert [(one.id, one.image) for one in result.wrong_marks] == [("P004", "left")]
@@ -126,6 +127,8 @@ def test_a_wrong_mark_is_named_with_its_image_in_three_images_and_not_in_two(
     two = intersect_files(MarkedImages((pair,), images(folder, 2), sigma_m=("3",)))
     assert two.wrong_marks == []
     assert any(note.startswith("15 of 15 points are marked in two images") for note in two.notes)
+    assert "P004" in two.disagreeing
+    assert not any("residuals are" in note for note in result.notes)
 
 
 def test_marks_in_one_image_are_left_out_by_name(folder: Path, tmp_path: Path) -> None:

@@ -85,6 +85,7 @@ def test_correct_marks_are_kept_also_where_they_scatter_more_than_stated() -> No
     found = intersect_marks(models, [OFF] * 3, careless, 200)
     assert found.rejected.sum() <= 2
     assert found.scale == pytest.approx(3.0, abs=0.3)
+    assert found.scale_chance < 1e-6
 
 
 def test_of_two_marks_that_disagree_neither_is_named() -> None:
