@@ -1,6 +1,6 @@
-"""Tiles of registered scenes on the map, in the form of OGC API - Tiles, for their owners."""
+"""Tiles of registered scenes and of surfaces, in the form of OGC API - Tiles, for their owners."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Response
 
@@ -11,6 +11,7 @@ from amers.app.api.routes import CallerRoute
 from amers.app.api.tiles import refuse_other_matrix_set
 from amers.app.usecases import jobs
 from amers.app.usecases.scene_map import Layer, scene_tile
+from amers.app.usecases.surface_map import surface_tile
 from amers.services.formats.images.map_tiles import tile_media_type
 from amers.services.orthorectification.tile_limits import TilePlace
 
@@ -35,19 +36,23 @@ router = APIRouter(tags=["tiles"], route_class=CallerRoute)
 def map_tile(
     *,
     job_id: JobId,
-    layer: Layer,
+    layer: Layer | Literal["surface"],
     place: TilePlaceDep,
     database: DatabaseDep,
     storage: StorageDep,
     caller: Reader,
 ) -> Response:
-    """Return a tile of a scene through its raw or its registered model, from a job `map-scene`.
+    """Return a tile of a scene (`raw`, `registered`) of a job `map-scene`, or of one's `surface`.
 
-    z, y and x are tile matrix, row and column. At the border of the scene a tile is transparent.
+    That of a job `make-surface` has the colours of the heights under a light from the north-west. z, y
+    and x are tile matrix, row and column. At the border a tile is transparent.
     """
     with database.reading() as connection:
         job = jobs.visible_job(connection, caller, job_id)
-    tile = scene_tile(storage, job, layer, place)
+    if layer == "surface":
+        tile = surface_tile(storage, job, place)
+    else:
+        tile = scene_tile(storage, job, layer, place)
     # Results never change; browsers ask again each time, so that the token is checked for every tile.
     tag = f'"{job.id}-{job.attempt}"'
     headers = {"ETag": tag, "Cache-Control": "private, no-cache", "X-Content-Type-Options": "nosniff"}

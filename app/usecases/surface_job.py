@@ -39,11 +39,12 @@ from amers.app.usecases.surface import (
     surface_inputs,
     write_surface,
 )
+from amers.app.usecases.surface_map import MAP_VALUES, SURFACE_NAME, map_values
 from amers.services.formats.images.surfaces import BANDS
 from amers.services.surface.options import MOST_FILL_CELLS, SurfaceOptions
 from amers.services.surface.surface import surface_grid
 
-SURFACE_NAME, REPORT_NAME = "surface.tif", "report.html"
+REPORT_NAME = "report.html"
 MOST_PAIRS = 100
 """Pairs of one job at most: each is matched over all the ground that it shows."""
 _CELL_BYTES = 4 * len(BANDS)
@@ -153,6 +154,7 @@ def _run(work: Work) -> Commit:
             place=WorkPlace(kept / hashlib.sha256(facts.encode()).hexdigest()),
             progress=work.progress,
         )
+        on_map = map_values(surface.path)
         files = store_results(work, {SURFACE_NAME: surface.path, REPORT_NAME: surface.report})
 
     def commit(connection: Connection) -> dict[str, Any]:
@@ -164,6 +166,7 @@ def _run(work: Work) -> Commit:
             "sigma_m": None if math.isnan(surface.sigma_m) else surface.sigma_m,
             "cells": surface.cells,
             "pairs": list(surface.pairs),
+            **on_map,
             "statements": stated_document(surface.statements),
             "files": files,
         }
@@ -216,6 +219,7 @@ MAKE_SURFACE = Process(
             "items": {"type": "object"},
             "title": "Pairs of scenes with their base over height, shift onto the others, and noise",
         },
+        **MAP_VALUES,
         "statements": STATEMENTS_VALUE,
     },
 )

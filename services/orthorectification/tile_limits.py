@@ -107,8 +107,22 @@ def choose_tiles(scenes: Sequence[Scene], heights_m: tuple[float, float]) -> lis
     Raises:
         InputError: the scene is too near to a pole for a map of the web.
     """
-    scene = scenes[0]
     lon_lat = np.concatenate([scene_footprint(one, heights_m) for one in scenes])
+    return tiles_over(lon_lat, scene_gsd_m(scenes[0]), math.prod(scenes[0].image.shape))
+
+
+def tiles_over(outline: Array, gsd_m: float, pixels: int) -> list[TileLimits]:
+    """The tiles of an image on the map; see `choose_tiles`.
+
+    Args:
+        outline: (n, 2) longitudes and latitudes.
+        gsd_m: of the image.
+        pixels: of the image, their number.
+
+    Raises:
+        InputError: the image is too near to a pole for a map of the web.
+    """
+    lon_lat = outline.copy()
     lon_lat[:, 0] = longitudes_near(lon_lat[:, 0], lon_lat[0, 0])
     lat = float(np.abs(lon_lat[:, 1]).max())
     if not lat <= _MOST_LATITUDE_DEG:
@@ -116,10 +130,10 @@ def choose_tiles(scenes: Sequence[Scene], heights_m: tuple[float, float]) -> lis
             f"the scene reaches latitude {lat:.2f} degrees; the map of the web ends at "
             f"{_MOST_LATITUDE_DEG:g} degrees"
         )
-    step_m = scene_gsd_m(scene) * float(map_units_per_metre(_CRS, lon_lat.mean(axis=0))[0])
+    step_m = gsd_m * float(map_units_per_metre(_CRS, lon_lat.mean(axis=0))[0])
     zoom = min(max(round(math.log2(_step_m(0) / step_m)), 0), MOST_ZOOM)
     finest = _limits(lon_lat, zoom)
-    most_tiles = _MOST_MAP_PIXELS * math.prod(scene.image.shape) / TILE_PX**2
+    most_tiles = _MOST_MAP_PIXELS * pixels / TILE_PX**2
     while finest.zoom > 0 and finest.rows * finest.columns > max(most_tiles, _FEW**2):
         finest = _limits(lon_lat, finest.zoom - 1)
     levels = [finest]

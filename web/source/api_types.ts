@@ -636,6 +636,20 @@ export interface StoredFile {
   sha256: string;
 }
 
+export interface SurfaceHeight {
+  distance_m: number;
+  lon: number;
+  lat: number;
+  height_m: number | null;
+  sigma_m: number | null;
+  views: number;
+  reason: string;
+}
+
+export interface SurfaceHeights {
+  heights: SurfaceHeight[];
+}
+
 export interface TemporalExtent {
   interval: ((string | null)[])[];
 }

@@ -11,7 +11,7 @@ import {
   VectorTileSource,
 } from "maplibre-gl";
 import { authorization, BASE, get } from "./api";
-import { type Bounds, Comparison, type Pyramids } from "./comparison";
+import { type Bounds, Comparison, type Pyramid, type Pyramids, TILE_PX } from "./comparison";
 import { h } from "./elements";
 import { goToField, TOWNS } from "./go_to";
 import { degrees, graticule, wrapped } from "./graticule";
@@ -45,6 +45,7 @@ export class Atlas {
   private colouring: Colouring = "none";
   private land = landFile(0);
   private namesTowns = false;
+  private picked: ((position: Position) => void) | null = null;
   /** Whether the reader has gone to a place: the page then does not move the map by itself. */
   went = false;
 
@@ -63,6 +64,7 @@ export class Atlas {
     for (const event of ["movestart", "dataloading"] as const) map.on(event, () => container.setAttribute("aria-busy", "true"));
     map.on("idle", () => container.setAttribute("aria-busy", "false"));
     map.on("click", (event) => {
+      if (this.picked) return this.picked([wrapped(event.lngLat.lng), event.lngLat.lat]);
       const { x, y } = event.point;
       const [point] = map.queryRenderedFeatures(
         [
@@ -142,6 +144,26 @@ export class Atlas {
     const comparison = new Comparison(this.map, pyramids, "scenes-inside");
     signal.addEventListener("abort", () => comparison.remove());
     return comparison;
+  }
+
+  /** Show a surface below the outlines of scenes, until the signal aborts; returns what sets its opacity, 0 to 1. */
+  async surface({ tiles, ...pyramid }: Pyramid, signal: AbortSignal): Promise<((opacity: number) => void) | null> {
+    await this.ready;
+    const map = this.map;
+    if (!map || signal.aborted) return null;
+    map.addSource("surface", { type: "raster", tileSize: TILE_PX, ...pyramid, tiles: [tiles] });
+    map.addLayer({ id: "surface", type: "raster", source: "surface", paint: { "raster-fade-duration": 0 } }, "scenes-inside");
+    signal.addEventListener("abort", () => {
+      map.removeLayer("surface");
+      map.removeSource("surface");
+    });
+    return (opacity) => map.setPaintProperty("surface", "raster-opacity", opacity);
+  }
+
+  /** Call back with the position of every click, instead of opening points, until the signal aborts. */
+  pick(callback: (position: Position) => void, signal: AbortSignal): void {
+    this.picked = callback;
+    signal.addEventListener("abort", () => (this.picked = null));
   }
 
   /** Load points and densities again, after a block was published or withdrawn. */

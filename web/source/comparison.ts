@@ -16,7 +16,7 @@ export interface Pyramid {
 }
 export type Pyramids = Record<Model, Pyramid>;
 
-const TILE_PX = 256;
+export const TILE_PX = 256;
 const STEPS = 1000;
 /** Width of the part of the slider that is moved, as in the style sheet. */
 const HANDLE_PX = 44;

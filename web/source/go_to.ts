@@ -60,7 +60,7 @@ export function goToField(toPosition: (position: Position) => void, toBox: (corn
 }
 
 /** Longitude and latitude of a text; latitude comes first where no letter tells them apart. Null if it is none. */
-function coordinate(text: string): Position | null {
+export function coordinate(text: string): Position | null {
   const [, first = "", one = "", second = "", other = ""] = COORDINATE.exec(text.toUpperCase()) ?? [];
   const longitudeFirst = /[EW]/.test(one) || /[NS]/.test(other);
   if (!first || (longitudeFirst && (/[NS]/.test(one) || /[EW]/.test(other)))) return null;

@@ -11,6 +11,7 @@ import { ended, find, stateText } from "./processes";
 import type { Criterion, Report } from "./report_types";
 import { imageOnMap } from "./image_on_map";
 import { type PointResultProperties, residualVectors } from "./residuals";
+import { surfaceOnMap } from "./surface";
 import type { Place, ShowView } from "./view";
 
 const POLL_MS = 1000;
@@ -88,7 +89,7 @@ async function showResults(place: Place, job: StatusInfo, heading: HTMLElement, 
   const reportFile = results["report.json"];
   const pointsFile = results["control_points.geojson"];
   if (!reportFile || !pointsFile) {
-    fill(body, outcome(job), assessment(results), blockLink(results), await downloads(results, signal));
+    fill(body, outcome(job), surfaceOnMap(place, job, results), assessment(results), blockLink(results), await downloads(results, signal));
     if (blockLink(results)) await showIngested(atlas, results, signal);
     return;
   }

@@ -131,6 +131,28 @@ class Messages(Reply):
     links: list[Link]
 
 
+class SurfaceHeight(Reply):
+    """What a surface has at a place; height and sigma are null where the cell has none.
+
+    The height is above the ellipsoid, sigma one standard deviation; `views` is the number of images that
+    show it, 0 where it was filled; `reason` says why there is no height.
+    """
+
+    distance_m: float
+    lon: float
+    lat: float
+    height_m: float | None
+    sigma_m: float | None
+    views: int
+    reason: str
+
+
+class SurfaceHeights(Reply):
+    """The heights of a surface at a place, or along a line at equal distances."""
+
+    heights: list[SurfaceHeight]
+
+
 class ResultFile(Reply):
     """A file of the results of a job, by reference."""
 

@@ -11,13 +11,14 @@ import rasterio
 from pyproj import CRS
 
 from amers.services.errors import FormatError
+from amers.services.formats.addresses import FilePlace
 from amers.services.formats.images.bands import one_band
 from amers.services.formats.images.datasets import GDAL_CACHE, as_format_error
 from amers.services.formats.images.raster import RasterImage, map_grid_of, open_raster
 from amers.services.imagery.source import Window
 from amers.services.map_grid import MapGrid
 from amers.services.surface.surface import SurfaceTile
-from amers.services.types import FloatImage
+from amers.services.types import Array, FloatImage
 
 BANDS = ("height_m", "sigma_m", "views", "reason")
 """Bands of the file of a surface."""
@@ -64,8 +65,37 @@ class SurfaceImage:
         counts = (np.nan_to_num(values).astype(np.uint8) for values in (views, reason))
         return SurfaceTile(window, height_m, sigma_m, *counts)
 
+    def at(self, line_sample: Array, every: float = 1.0) -> FloatImage:
+        """All bands in the cells at some positions: of the cell itself, or of one near it.
 
-def open_surface(path: Path) -> SurfaceImage:
+        Args:
+            line_sample: (n, 2) positions in the grid; NaN for none.
+            every: cells from one position to the next, so that as few are read.
+
+        Returns:
+            (bands, n); NaN outside.
+
+        Raises:
+            FormatError: the file cannot be read there.
+        """
+        out = np.full((len(BANDS), len(line_sample)), np.nan, dtype=np.float32)
+        inside = np.flatnonzero(self.grid.contains(line_sample))
+        if not len(inside):
+            return out
+        cell = np.minimum(np.floor(line_sample[inside] + 0.5), np.array(self.grid.shape) - 1.0)
+        first, end = cell.min(axis=0), cell.max(axis=0) + 1.0
+        shape = np.ceil((end - first) / max(every, 1.0)).astype(int)
+        with as_format_error(self.image.path, "readable pixels"), rasterio.Env(**GDAL_CACHE):
+            bands = self.image.dataset.read(
+                window=((int(first[0]), int(end[0])), (int(first[1]), int(end[1]))),
+                out_shape=(len(BANDS), int(shape[0]), int(shape[1])),
+            )
+        line, sample = ((cell - first) * shape / (end - first)).astype(int).T
+        out[:, inside] = bands[:, line, sample]
+        return out
+
+
+def open_surface(path: FilePlace) -> SurfaceImage:
     """Open the file of a surface.
 
     Raises:
