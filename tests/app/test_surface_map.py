@@ -1,5 +1,6 @@
 """The surface of a job on the map: tiles and heights for its owner, for nobody else."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -9,11 +10,18 @@ from fastapi.testclient import TestClient
 
 from amers.app.config import Settings
 from amers.app.db.engine import Database
-from amers.services.orthorectification.tile_limits import TileLimits
+from amers.app.errors import DamagedFile
+from amers.app.storage import Storage
+from amers.app.usecases.surface_map import map_values, surface_heights, surface_tile
+from amers.services.orthorectification.tile_limits import TileLimits, TilePlace
 from tests.app.callers import Bearer
+from tests.app.job_queue import new_job
 from tests.app.ledger import job_runner, make_token
+from tests.app.s3_server import running_bucket
 from tests.app.surface_world import OPTIONS, write_pair
+from tests.app.test_surface_difference import write_surface
 from tests.services.surface.worlds import town
+from tests.unproven import unproven_storage
 
 OPEN_GROUND = town().centre_lon_lat[None, :] + [[0.0, -0.0004]]
 MADE = {"gsd_m": 1.0, "heights_m": OPTIONS.heights_m}
@@ -75,3 +83,33 @@ def test_tiles_and_heights_of_a_surface_are_for_its_owner(
         assert stranger.get(path).status_code == 404
         assert client.get(path).status_code == 401
         assert bearer("admin").get(path).status_code == 200
+
+
+def test_a_surface_in_a_bucket_is_shown_as_one_in_a_folder(
+    settings: Settings,
+    storage: Storage,
+    database: Database,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    surface = write_surface(tmp_path / "surface.tif")
+    key, values = "results/a/1/surface.tif", map_values(surface)
+    job = replace(new_job(database), results={**values, "files": {"surface.tif": key}})
+    west, south, east, north = values["bounds"]
+    line = np.array([[west, south], [east, north]])
+    finest = TileLimits(**values["tile_limits"][0])
+    place = TilePlace(finest.zoom, finest.first_row + 1, finest.first_column + 1)
+    with running_bucket(monkeypatch) as url:
+        bucket = unproven_storage(settings.model_copy(update={"storage_url": url}))
+        shown = []
+        for kept in (storage, bucket):
+            kept.put_file(key, surface)
+            shown.append((surface_tile(kept, job, place), surface_heights(kept, job, line)))
+        assert shown[0] == shown[1]
+        assert sum(one.height_m is not None for one in shown[0][1]) > 200
+        bucket.delete(key)
+        with pytest.raises(DamagedFile, match="missing from the storage"):
+            surface_tile(bucket, job, place)
+    storage.path(key).write_bytes(b"II*\0 no surface")
+    with pytest.raises(DamagedFile):
+        surface_heights(storage, job, line)
