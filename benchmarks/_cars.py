@@ -64,7 +64,11 @@ def cars_surface(command: str, images: dict[Path, Path], grid: MapGrid) -> Made 
                 "pairing": list(combinations(stems, 2)),
             },
             "orchestrator": {"mode": "sequential"},
-            "output": {"directory": str(folder / "out"), "resolution": float(grid.step_xy[0, 1])},
+            "output": {
+                "directory": str(folder / "out"),
+                "resolution": float(grid.step_xy[0, 1]),
+                "geoid": False,
+            },
         }
         (folder / "settings.json").write_text(json.dumps(settings))
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
