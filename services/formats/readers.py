@@ -52,6 +52,7 @@ OWN_FILES = frozenset(
         "read_feature_csv",
         "read_map_tile",
         "read_points",
+        "read_reduced",
         "read_runs",
         "read_views",
     }
