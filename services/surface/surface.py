@@ -175,4 +175,5 @@ def _heights_m(scenes: Sequence[Scene], options: SurfaceOptions) -> tuple[float,
             f"heights from {stated_low:g} to {stated_high:g} m are stated, the models of the scenes are "
             f"meant for {low:.0f} to {high:.0f} m above the ellipsoid: check the heights"
         )
-    return options.heights_m
+    # Models say nothing of what is beyond their heights.
+    return max(low, stated_low), min(high, stated_high)

@@ -134,6 +134,22 @@ def test_no_surface_is_stated_without_a_pair_or_where_none_is_asked_for() -> Non
         assert np.isnan(found.sigma_m).all()
 
 
+def test_points_far_apart_have_the_same_surface_as_those_of_a_whole() -> None:
+    """Between them nothing is matched; towers would reach beyond the heights of the models."""
+    made = production()
+    delivered = [view.as_scene(BLOCK_SIGMA_M) for view in block_views()]
+    pairs = zip(delivered, made.adjustment.models, strict=True)
+    scenes = [replace(scene, model=model) for scene, model in pairs]
+    places = made.points.lon_lat_h
+    assert made.points.surface is not None
+    known = np.flatnonzero(np.isfinite(made.points.surface.height_m))
+    assert len(known) > 0.9 * len(places)
+    rows = known[[places[known, axis].argmin() for axis in (0, 1)] + [places[known, 0].argmax()]]
+    alone = surfaces_at(scenes, places[rows], 10, work=Work(), progress=no_progress)
+    off_m = alone.height_m - made.points.surface.height_m[rows]
+    assert (np.abs(off_m) < np.maximum(1.0, 2.0 * alone.sigma_m)).all()
+
+
 def read_triplet(folder: Path, names: Sequence[str]) -> list[Scene]:
     scenes = []
     for name in names:
