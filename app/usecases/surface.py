@@ -20,7 +20,7 @@ from amers.app.usecases.registered_scene import SceneModel, adjusted_model, read
 from amers.app.usecases.report_files import write_texts
 from amers.services.datums import horizontal
 from amers.services.formats.images.ortho import BandForm, write_cog
-from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.images.scenes import read_scene, scene_name
 from amers.services.formats.images.surfaces import BANDS, heights_crs, read_reduced
 from amers.services.formats.work_folder import WorkFolder
 from amers.services.imagery.scene import Scene
@@ -270,7 +270,7 @@ def _windows(tiles: Iterator[SurfaceTile]) -> Iterator[OrthoWindow]:
 def _scene(image: Path, files: SurfaceFiles, stack: ExitStack) -> Scene:
     """A scene with its refined model, open until the stack closes."""
     if files.registered is not None:
-        registration = files.registered / image.stem
+        registration = files.registered / scene_name(image)
         scene, _ = read_registered_scene(SceneModel(image, registration=registration))
     elif files.block is not None:
         scene = read_scene(image, adjusted_model(files.block, image), sigma_m=1.0)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from amers.services.errors import CoverageError
+from amers.services.errors import ComputationError, CoverageError
 from amers.services.imagery.scene import Scene, scene_gsd_m
 from amers.services.imagery.source import Window
 from amers.services.map_grid import MapGrid, utm_of, xy_of_lon_lat
@@ -39,7 +39,8 @@ def surfaces_at(
         progress: receives the fraction done.
 
     Returns:
-        NaN where no two images show the place under angles that give heights, or nothing was matched.
+        NaN where no two images show the place under angles that give heights, nothing was matched, or
+        the ground is too steep for the approximation of the models.
     """
     if pairs == 0:
         return SurfaceHeights(*np.full((2, len(lon_lat_h)), np.nan))
@@ -73,7 +74,7 @@ def surface_task(scenes: Sequence[Scene], lon_lat_h: Array, pairs: int) -> Array
     near_each_other = len(windows) * (_SIDE_CELLS + 2 * MARGIN_CELLS) ** 2 > np.prod(grid.shape)
     try:
         surface = make_surface(scenes, options, grid=grid, windows=None if near_each_other else windows)
-    except CoverageError:
+    except (CoverageError, ComputationError):
         return {"height_m": height_m, "sigma_m": sigma_m}
     for tile in surface_tiles(surface):
         first = np.array([tile.window.line, tile.window.sample])
