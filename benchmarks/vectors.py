@@ -170,7 +170,7 @@ def whole(
     """The outcomes of the whole correction, in memory and from file to file."""
     scene = Scene(ArrayImage(np.ones((1, 1), dtype=np.float32)), model, Acquisition("a"), 5.0)
     terrain = read_terrain(TerrainFile(dem, "ellipsoid"))
-    sources = ErrorSources(None, 5.0, 3.0, 0.5)
+    sources = ErrorSources(None, 5.0, 0.5)
     count = int(shapely.get_num_coordinates(drawn).sum())
 
     def corrected(geometries: Geometries) -> Geometries:

@@ -17,6 +17,8 @@ from amers.services.types import Array, FloatImage, IntArray
 Geoid = Callable[[Array], Array]
 """Height (n,) of a geoid above the ellipsoid at longitudes and latitudes (n, 2), metres."""
 
+HEIGHT_SIGMA_POSTINGS = 0.1
+"""Assumed standard deviation of heights between the nodes of a terrain, in distances of its nodes."""
 _TILE = 2048
 """Side of the windows in which a grid is read, cells."""
 _MAX_CELLS_IN_MEMORY = 64_000_000
@@ -32,6 +34,8 @@ class Terrain:
         heights: metres above the geoid, or above the ellipsoid without one; NaN in voids.
         geoid: vertical datum of the heights; None for the ellipsoid.
         vertical: origin of the vertical datum, one sentence.
+        sigmas: one standard deviation of the heights in metres, at the nodes, or one for all; None
+            assumes 0.1 of the distance of the nodes.
         statements: of its files.
     """
 
@@ -40,6 +44,7 @@ class Terrain:
     geoid: Geoid | None = None
     vertical: str = "metres above the ellipsoid"
     statements: Statements = ()
+    sigmas: ImageSource | float | None = None
 
     @property
     def posting_m(self) -> float:
@@ -53,11 +58,22 @@ class Terrain:
         outermost nodes the height is constant.
         """
         position = self.grid.line_sample(np.asarray(lon_lat, dtype=np.float64)[:, :2])
-        height_m = self._heights_at(position)
+        height_m = self._values_at(self.heights, position)
         valid = np.flatnonzero(np.isfinite(height_m))
         if self.geoid is not None and len(valid):
             height_m[valid] += self.geoid(lon_lat[valid, :2])
         return height_m
+
+    def sigma_m(self, lon_lat: Array) -> Array:
+        """One standard deviation (n,) of the heights at longitudes and latitudes (n, 2), metres.
+
+        One for all places, or that of each, bilinear between the nodes; NaN then where `height_m` is.
+        """
+        if self.sigmas is None or isinstance(self.sigmas, float):
+            one_m = HEIGHT_SIGMA_POSTINGS * self.posting_m if self.sigmas is None else self.sigmas
+            return np.full(len(lon_lat), one_m)
+        position = self.grid.line_sample(np.asarray(lon_lat, dtype=np.float64)[:, :2])
+        return self._values_at(self.sigmas, position)
 
     def slope(self, lon_lat: Array) -> Array:
         """Slope (n, 2) of the ground, metres up per metre east and north; NaN where `height_m` is.
@@ -96,14 +112,9 @@ class Terrain:
             )
         lines, samples = (int(size) for size in high - low + 1)
         window = Window(int(low[0]), int(low[1]), lines, samples)
-        heights: ImageSource = _CroppedImage(self.heights, window)
-        if isinstance(self.heights, ArrayImage):
-            heights = ArrayImage(self.heights.pixels[low[0] : high[0] + 1, low[1] : high[1] + 1])
-        elif lines * samples <= _MAX_CELLS_IN_MEMORY:
-            heights = ArrayImage(self.heights.read(window))
         origin_xy = self.grid.xy(low[None, :].astype(np.float64))[0]
         grid = replace(self.grid, origin_xy=origin_xy, shape=(lines, samples))
-        return replace(self, grid=grid, heights=heights)
+        return self._with(grid, lambda image: _part(image, window))
 
     def seamless(self, lon_lat: Array) -> "Terrain":
         """The same terrain; one around the Earth begins where its seam is not among positions (n, 2)."""
@@ -127,7 +138,14 @@ class Terrain:
         origin_xy = self.grid.xy(np.array([[0.0, float(first)]]))[0]
         shape = (self.grid.shape[0], period)
         grid = replace(self.grid, origin_xy=origin_xy, shape=shape)
-        return replace(self, grid=grid, heights=_RolledImage(self.heights, first, shape))
+        return self._with(grid, lambda image: _RolledImage(image, first, shape))
+
+    def _with(self, grid: MapGrid, changed: Callable[[ImageSource], ImageSource]) -> "Terrain":
+        """The same terrain on another grid, with its heights and their sigmas at the nodes changed."""
+        sigmas = self.sigmas
+        if sigmas is not None and not isinstance(sigmas, float):
+            sigmas = changed(sigmas)
+        return replace(self, grid=grid, heights=changed(self.heights), sigmas=sigmas)
 
     def range_m(self) -> tuple[float, float]:
         """Lowest and highest ground, metres above the ellipsoid; bounds of them where there is a geoid.
@@ -168,15 +186,15 @@ class Terrain:
         for window in _tiles((0, 0), self.grid.shape):
             yield self.heights.read(window)
 
-    def _heights_at(self, position: Array) -> Array:
-        """Heights (n,) of the grid at positions (n, 2) in it; NaN outside."""
-        if isinstance(self.heights, ArrayImage):
-            return bilinear_heights(self.nodes(), position)
-        height_m = np.full(len(position), np.nan)
+    def _values_at(self, image: ImageSource, position: Array) -> Array:
+        """Values (n,) of an image on the grid at positions (n, 2) in it; NaN outside."""
+        if isinstance(image, ArrayImage):
+            return bilinear_heights(image.pixels, position)
+        values = np.full(len(position), np.nan)
         for window, rows in self._pieces(position):
             first = np.array([window.line, window.sample], dtype=np.float64)
-            height_m[rows] = bilinear_heights(self.heights.read(window), position[rows] - first)
-        return height_m
+            values[rows] = bilinear_heights(image.read(window), position[rows] - first)
+        return values
 
     def _pieces(self, position: Array) -> Iterator[tuple[Window, IntArray]]:
         """Yield windows of the grid, each with the rows of the positions that it contains."""
@@ -192,6 +210,16 @@ class Terrain:
             high = np.minimum(node[part].max(axis=0) + 1, np.array(self.grid.shape) - 1)
             lines, samples = (int(size) for size in high - low + 1)
             yield Window(int(low[0]), int(low[1]), lines, samples), rows[part]
+
+
+def _part(image: ImageSource, window: Window) -> ImageSource:
+    """A window of an image inside it, in memory unless it is too large."""
+    if isinstance(image, ArrayImage):
+        lines = slice(window.line, window.line + window.lines)
+        return ArrayImage(image.pixels[lines, window.sample : window.sample + window.samples])
+    if window.lines * window.samples <= _MAX_CELLS_IN_MEMORY:
+        return ArrayImage(image.read(window))
+    return _CroppedImage(image, window)
 
 
 @dataclass(frozen=True)

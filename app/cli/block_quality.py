@@ -63,7 +63,8 @@ class HeightOptions(TerrainOptions):
     Attributes:
         dem: heights to compare with: a file, or a folder or .txt list of tiles.
         vertical: vertical datum of --dem: ellipsoid, EGM96, EGM2008, EPSG:…
-        dem_sigma_m: sigma of these heights, metres; by default 0.1 of their step.
+        dem_sigma_m: sigma of these heights, metres; by default that of each cell of a surface,
+            else 0.1 of their step.
         dem_frame_sigma_m: sigma of the error that all of them share, metres.
         exclude_heights: ground where --dem is not to be trusted; the same; repeat.
         land_cover: image of land cover classes, to tell heights apart.

@@ -35,7 +35,7 @@ class ControlOptions:
             list of tiles.
         control_dem_vertical: vertical datum of --control-dem: ellipsoid, EGM96, EGM2008, EPSG:…
         control_dem_geoid: grid file of the geoid of --control-dem, GTX or GeoTIFF.
-        control_dem_sigma_m: sigma of single heights of --control-dem, metres.
+        control_dem_sigma_m: sigma of single heights of --control-dem, metres; a surface has its own.
         control_dem_frame_sigma_m: error that all of --control-dem has: HORIZONTAL,UP, one sigma, metres.
     """
 

@@ -37,7 +37,8 @@ class HeightFile:
 
     Attributes:
         terrain: the file, with its vertical datum.
-        sigma_m: of its heights, one standard deviation, independent from place to place.
+        sigma_m: of its heights, one standard deviation, independent from place to place; by default
+            that of each cell of a surface.
         frame_sigma_m: horizontal and up, of the error that the whole model has.
     """
 
@@ -156,7 +157,6 @@ def _ortho(path: Path, sigma_m: float | None, stack: ExitStack) -> ControlOrtho:
         model=scene.model,
         terrain=None,
         sigma_m=LOCAL_SIGMA_PX * gsd_m,
-        height_sigma_m=math.nan,
         common_sigma_m=COMMON_SIGMA_PX * gsd_m,
         frame=Frame.from_sigmas(stated_m, math.nan),
         statements=scene.statements,
@@ -166,14 +166,14 @@ def _ortho(path: Path, sigma_m: float | None, stack: ExitStack) -> ControlOrtho:
 
 def _heights(heights: HeightFile) -> ControlHeights:
     name = heights.terrain.dem.name
-    if heights.sigma_m is None or heights.frame_sigma_m is None:
-        raise InputError(
-            f"{name}: the accuracy of these heights is not stated: give the error of single heights "
-            "with --control-dem-sigma-m, and the common error of the whole model with "
-            "--control-dem-frame-sigma-m HORIZONTAL,UP, one standard deviation in metres"
-        )
     try:
-        terrain = read_terrain(heights.terrain)
+        terrain = read_terrain(heights.terrain, heights.sigma_m)
     except VerticalDatumError as error:
         raise InputError(f"{error} (--control-dem-vertical, --control-dem-geoid)") from None
-    return ControlHeights(name, terrain, heights.sigma_m, Frame.from_sigmas(*heights.frame_sigma_m))
+    if terrain.sigmas is None or heights.frame_sigma_m is None:
+        raise InputError(
+            f"{name}: the accuracy of these heights is not stated: give the error of single heights "
+            "with --control-dem-sigma-m (a surface has its own), and the common error of the whole "
+            "model with --control-dem-frame-sigma-m HORIZONTAL,UP, one standard deviation in metres"
+        )
+    return ControlHeights(name, terrain, Frame.from_sigmas(*heights.frame_sigma_m))

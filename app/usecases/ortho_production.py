@@ -16,7 +16,7 @@ from amers.app.usecases.new_block import (
     points_per_km2,
     refuse_existing,
 )
-from amers.app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
+from amers.app.usecases.terrain_file import TerrainFile, read_terrain
 from amers.services.formats.block.document import BlockMetadata, BlockSpecification
 from amers.services.formats.block.writer import write_block
 from amers.services.formats.images.bands import parse_bands
@@ -40,7 +40,8 @@ class OrthoFiles:
         images: GeoTIFF (or COG) or JPEG 2000 on a map; several of one place, the most accurate first.
         terrain: heights of the ground; None takes `flat_m` everywhere.
         flat_m: height of flat ground above the ellipsoid, metres; replaces --dem.
-        height_sigma_m: sigma of the heights, metres; by default 0.1 of the terrain's step.
+        height_sigma_m: sigma of the heights, metres; by default that of each cell of a surface, else
+            0.1 of the terrain's step.
         sigma_m: accuracy of the images on the map, one sigma, metres; by default that of their
             sensors.
         frame_sigma_up_m: error that all the heights share, one sigma, metres; by default unknown.
@@ -129,9 +130,8 @@ def _ground_heights(files: OrthoFiles) -> GroundHeights:
             "heights of the ground: either a terrain (--dem) or one flat height (--height-m) is expected"
         )
     if files.terrain is not None:
-        terrain = read_terrain(files.terrain)
-        sigma_m = files.height_sigma_m or HEIGHT_SIGMA_POSTINGS * terrain.posting_m
-        return GroundHeights(terrain, 0.0, sigma_m, frame_sigma_m)
+        terrain = read_terrain(files.terrain, files.height_sigma_m)
+        return GroundHeights(terrain, frame_sigma_m=frame_sigma_m)
     if files.flat_m is None or files.height_sigma_m is None:
         raise InputError("one flat height: its standard deviation (--height-sigma-m) is missing")
     return GroundHeights(None, files.flat_m, files.height_sigma_m, frame_sigma_m)

@@ -19,7 +19,7 @@ from amers.app.usecases.new_block import (
     image_accuracy,
     refuse_existing,
 )
-from amers.app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
+from amers.app.usecases.terrain_file import TerrainFile, read_terrain
 from amers.services.datums import filled_sigmas
 from amers.services.errors import refuse_unstated
 from amers.services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification
@@ -59,7 +59,8 @@ class KnownPointFiles:
         stated: what the file of the points does not state.
         point_sigma_m: horizontal and up, one standard deviation, of points whose file states none.
         terrain: gives the heights of points without any.
-        height_sigma_m: sigma of the heights of --dem, metres; by default 0.1 of its step.
+        height_sigma_m: sigma of the heights of --dem, metres; by default that of each cell of a
+            surface, else 0.1 of its step.
         sigma_m: accuracy of the images' models, one sigma, metres; by default that of the producer or
             the sensor.
         frame_sigma_m: error that all points share, horizontal, one sigma, metres; by default unknown.
@@ -224,11 +225,11 @@ def _ground_points(files: KnownPointFiles) -> GroundPoints:
     refuse_unstated(unstated)
     if not missing.any() or files.terrain is None:
         return ground
-    terrain = read_terrain(files.terrain)
+    terrain = read_terrain(files.terrain, files.height_sigma_m)
     lon_lat_h = ground.lon_lat_h.copy()
     lon_lat_h[missing, 2] = terrain.height_m(lon_lat_h[missing, :2])
     sigma_m = sigma_m.copy()
-    sigma_m[missing, 2] = files.height_sigma_m or HEIGHT_SIGMA_POSTINGS * terrain.posting_m
+    sigma_m[missing, 2] = terrain.sigma_m(lon_lat_h[missing, :2])
     statements = ground.statements + terrain.statements
     return replace(ground, lon_lat_h=lon_lat_h, sigma_m=sigma_m, statements=statements)
 

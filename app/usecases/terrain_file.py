@@ -1,14 +1,11 @@
 """Terrains in files, as commands and jobs name them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from amers.services.errors import MissingGeoid
 from amers.services.formats.elevation.dem import read_dem
 from amers.services.terrain import Terrain
-
-HEIGHT_SIGMA_POSTINGS = 0.1
-"""Assumed standard deviation of heights between the nodes of a terrain, in distances of its nodes."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +29,21 @@ class TerrainFile:
     is_uploaded: bool = False
 
 
-def read_terrain(file: TerrainFile) -> Terrain:
+def read_terrain(file: TerrainFile, sigma_m: float | None = None) -> Terrain:
     """The terrain of a file; it stays open and is read by windows.
+
+    Args:
+        file: with the heights.
+        sigma_m: one standard deviation of its heights; by default that of each cell of a surface, and
+            0.1 of the distance of the nodes for others.
 
     Raises:
         InputError: the file cannot be used, or the vertical datum is unknown.
     """
     try:
-        return read_dem(file.dem, file.vertical, file.geoid, file.fill_px, images_only=file.is_uploaded)
+        terrain = read_dem(
+            file.dem, file.vertical, file.geoid, file.fill_px, images_only=file.is_uploaded
+        )
     except MissingGeoid as error:
         raise MissingGeoid(f"{file.dem}: {error} with {file.geoid_option}") from None
+    return terrain if sigma_m is None else replace(terrain, sigmas=float(sigma_m))

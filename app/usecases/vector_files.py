@@ -56,7 +56,8 @@ class CorrectionOptions(VectorOptions):
     Attributes:
         margin_px: vertices may lie this far outside the image, pixels.
         sigma_px: precision of the digitised vertices, one sigma, pixels.
-        height_sigma_m: accuracy of the heights, one sigma; by default 0.1 postings.
+        height_sigma_m: accuracy of the heights, one sigma; by default that of each cell of a surface,
+            else 0.1 postings.
     """
 
     margin_px: float = 5.0

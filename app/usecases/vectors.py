@@ -8,7 +8,7 @@ import shapely
 
 from amers.app.errors import InputError
 from amers.app.usecases.registered_scene import SceneModel, read_raw_scene
-from amers.app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
+from amers.app.usecases.terrain_file import TerrainFile, read_terrain
 from amers.app.usecases.vector_files import (
     CorrectionOptions,
     ProjectionOptions,
@@ -33,7 +33,6 @@ from amers.services.map_grid import check_map, check_map_code
 from amers.services.quality.accuracy_statement import StatedAccuracy, vertices_accuracy
 from amers.services.quality.correction_accuracy import CorrectionAccuracy
 from amers.services.statements import Statements, gathered
-from amers.services.terrain import Terrain
 from amers.services.types import IntArray
 from amers.services.vectors.accuracy import ErrorSources
 from amers.services.vectors.correct import CorrectedVectors, correct_vectors, has_heights, missed_place
@@ -64,7 +63,7 @@ class CorrectedFile:
         left_out: numbers of the features, from 1, with a place that meets no ground.
         unusable: numbers of the features whose geometry cannot be used, with the reason; left out too.
         renamed: attributes that have other names in the file, with these.
-        height_sigma_m: of the terrain, as used.
+        height_sigma_m: of the terrain, as used; the median of its places.
         relative_to_control_points, on_the_earth: predicted accuracy of the vertices.
         statements: of the files of the scene, the terrain and the vectors.
     """
@@ -155,10 +154,10 @@ def correct_file(
     if crs is not None:
         check_map_code(crs)
     scene, registration = read_raw_scene(scene_model)
-    ground = read_terrain(terrain)
+    ground = read_terrain(terrain, options.height_sigma_m)
     layer = read_pixel_layer(vectors.path, vectors.layer)
     shapes = _in_image(layer, scene, options)
-    sources = _error_sources(scene_model, registration, ground, options)
+    sources = _error_sources(scene_model, registration, options)
     crs = crs or default_crs(output, scene)
     corrected = correct_vectors(
         shapes, scene, ground, crs, sources=sources, tolerance_px=options.tolerance_px
@@ -176,7 +175,7 @@ def correct_file(
         len(used),
         corrected.added,
         tuple((np.flatnonzero(corrected.missed) + 1).tolist()),
-        sources.height_sigma_m,
+        corrected.height_sigma_m,
         stated.relative_to_control_points,
         stated.on_the_earth,
         by_number(layer.unusable),
@@ -196,15 +195,11 @@ def _in_image(layer: VectorLayer, scene: Scene, options: CorrectionOptions) -> S
 def _error_sources(
     scene_model: SceneModel,
     registration: CorrectionAccuracy | None,
-    ground: Terrain,
     options: CorrectionOptions,
 ) -> ErrorSources:
-    """What is stated, or else taken to be, of the errors of model, terrain and vertices."""
-    height_sigma_m = options.height_sigma_m
-    if height_sigma_m is None:
-        height_sigma_m = HEIGHT_SIGMA_POSTINGS * ground.posting_m
+    """What is stated of the errors of model and vertices."""
     model_sigma_m = float("nan") if scene_model.sigma_m is None else scene_model.sigma_m
-    return ErrorSources(registration, model_sigma_m, height_sigma_m, options.sigma_px)
+    return ErrorSources(registration, model_sigma_m, options.sigma_px)
 
 
 def _entries(corrected: CorrectedVectors) -> IntArray:

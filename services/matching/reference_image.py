@@ -35,6 +35,8 @@ from amers.services.types import (
     no_progress,
 )
 
+NO_HEIGHT_SIGMA_M = 5000.0
+"""Sigma of unknown heights: land reaches from -430 to 8,850 m."""
 _NODE_PX = 4
 """Pixels of a level between the lines of sight that are intersected with the terrain."""
 
@@ -46,10 +48,10 @@ class Reference:
     Attributes:
         image: its pixels.
         model: an ortho model.
-        terrain: the ground; None assumes height zero, which only a scene without parallax allows.
+        terrain: the ground, with the sigma of its heights; None assumes height zero, which only a scene
+            without parallax allows.
         sigma_m: position of a detail relative to the rest of the image, one standard deviation a
             coordinate.
-        height_sigma_m: height of the terrain, one standard deviation.
         common_sigma_m: error that all positions measured on the image share, one standard deviation a
             coordinate: shadows and roofs lean the same way everywhere.
         frame: position of the whole image on the Earth, and of the heights of the terrain.
@@ -60,10 +62,15 @@ class Reference:
     model: SensorModel
     terrain: Terrain | None
     sigma_m: float
-    height_sigma_m: float
     common_sigma_m: float
     frame: Frame = UNKNOWN_FRAME
     statements: Statements = ()
+
+    def height_sigma_m(self, lon_lat: Array) -> Array:
+        """One standard deviation (n,) of the heights of places at (n, 2), metres."""
+        if self.terrain is None:
+            return np.full(len(lon_lat), NO_HEIGHT_SIGMA_M)
+        return self.terrain.sigma_m(lon_lat)
 
 
 @dataclass(frozen=True)

@@ -42,14 +42,13 @@ class ControlHeights:
 
     Attributes:
         name: for messages and reports.
-        terrain: heights of the ground, or of the surface.
-        sigma_m: of the heights, one standard deviation, independent from point to point.
+        terrain: heights of the ground, or of the surface; their sigma is independent from point to
+            point.
         frame: error that all of them share: position of the model, and its heights.
     """
 
     name: str
     terrain: Terrain
-    sigma_m: float
     frame: Frame
 
 
@@ -106,8 +105,9 @@ def known_heights(
     """
     off_m = float(np.hypot(place_sigma_m, heights.frame.sigma_m))
     ground_m, slope, rough_m = _planes(lon_lat_h, heights.terrain, off_m)
+    sigma_m = heights.terrain.sigma_m(lon_lat_h)
     with np.errstate(invalid="ignore"):
-        smooth = (rough_m <= _ROUGHEST * heights.sigma_m) & (np.hypot(*slope.T) <= _STEEPEST)
+        smooth = (rough_m <= _ROUGHEST * sigma_m) & (np.hypot(*slope.T) <= _STEEPEST)
     rows = np.flatnonzero(smooth & np.isfinite(above.height_m))
     if len(rows) < _MIN_FOUND:
         raise NotEnoughPoints(
@@ -116,11 +116,11 @@ def known_heights(
             f"points on smooth ground of the elevation model {heights.name}: {len(lon_lat_h)} tried, "
             f"{int(np.isfinite(rough_m).sum())} where it has heights, {int(smooth.sum())} of them on "
             f"ground that is not steep and not rougher than {_ROUGHEST:g} times its sigma of "
-            f"{heights.sigma_m:g} m (--control-dem-sigma-m); the images show no smooth surface at the "
-            "others",
+            f"{np.nanmedian(sigma_m):g} m (--control-dem-sigma-m); the images show no smooth surface at "
+            "the others",
         )
     mean = slope[rows].mean(axis=0)
-    own_m2 = heights.sigma_m**2 + rough_m**2 + above.sigma_m**2
+    own_m2 = sigma_m**2 + rough_m**2 + above.sigma_m**2
     own_m2 = own_m2 + ((slope - mean) ** 2).sum(axis=1) * off_m**2
     rows = np.sort(rows[np.argsort(own_m2[rows], kind="stable")[:_MOST]])
     covariance_m2 = np.tile(np.diag([np.inf, np.inf, 0.0]), (len(rows), 1, 1))
@@ -167,7 +167,8 @@ def ortho_heights(
     steep2 = (heights.terrain.slope(place[:, :2]) ** 2).sum(axis=1)
     known = np.flatnonzero(np.isfinite(place[:, 2]) & np.isfinite(steep2))
     covariance_m2 = np.tile(np.diag([np.inf, np.inf, 0.0]), (len(known), 1, 1))
-    covariance_m2[:, 2, 2] = heights.sigma_m**2 + steep2[known] * off_m2[known]
+    sigma_m = heights.terrain.sigma_m(place[known])
+    covariance_m2[:, 2, 2] = sigma_m**2 + steep2[known] * off_m2[known]
     return ControlGround(
         point=point[known],
         lon_lat_h=place[known],

@@ -69,15 +69,15 @@ class GroundHeights:
 
     Attributes:
         terrain: a terrain model; None for flat ground.
-        flat_m: height of flat ground, metres above the ellipsoid; not used with a terrain.
-        sigma_m: of the heights, one standard deviation.
+        flat_m, flat_sigma_m: height of flat ground, metres above the ellipsoid, and its standard
+            deviation; not used with a terrain.
         frame_sigma_m: of the error that all the heights share, such as that of their datum; NaN when
             unknown.
     """
 
     terrain: Terrain | None
-    flat_m: float
-    sigma_m: float
+    flat_m: float = math.nan
+    flat_sigma_m: float = math.nan
     frame_sigma_m: float = math.nan
 
     @property
@@ -90,6 +90,12 @@ class GroundHeights:
         if self.terrain is not None:
             return self.terrain.height_m(lon_lat)
         return np.full(len(lon_lat), self.flat_m)
+
+    def sigma_m(self, lon_lat: Array) -> Array:
+        """One standard deviation (n,) of the heights at longitudes and latitudes (n, 2), metres."""
+        if self.terrain is not None:
+            return self.terrain.sigma_m(lon_lat)
+        return np.full(len(lon_lat), self.flat_sigma_m)
 
 
 @dataclass(frozen=True)
@@ -160,12 +166,13 @@ def produce_ortho_points(
         raise NotEnoughPoints(len(rows), _MIN_POINTS, what)
     progress(1.0, f"{len(rows)} points")
     sigma_m = max(scene_gsd_m(scene) * options.local_sigma_px, np.nan_to_num(agreed.local_sigma_m))
-    covariance_m2 = np.diag(np.array([sigma_m, sigma_m, heights.sigma_m]) ** 2)
+    covariance_m2 = np.tile(np.eye(3) * sigma_m**2, (len(rows), 1, 1))
+    covariance_m2[:, 2, 2] = heights.sigma_m(lon_lat_h[rows]) ** 2
     points = detail_points(
         agreed,
         rows,
         lon_lat_h[rows],
-        np.tile(covariance_m2, (len(rows), 1, 1)),
+        covariance_m2,
         saliency=np.array([corners[row].saliency for row in rows]),
         frame=Frame.from_sigmas(scene.sigma_m * agreed.disagreement, heights.frame_sigma_m),
         gsds_m=gsds_m,

@@ -31,15 +31,14 @@ class HeightModel:
     """Heights that points are compared with.
 
     Attributes:
-        terrain: heights of the ground, or of the surface.
-        sigma_m: of the heights, one standard deviation, independent from point to point.
+        terrain: heights of the ground, or of the surface; their sigma is independent from point to
+            point.
         frame_sigma_m: of the error that all the heights share, such as that of their datum; 0 when
             unknown.
         excluded: ground where they are not to be trusted, such as filled voids and towns.
     """
 
     terrain: Terrain
-    sigma_m: float
     frame_sigma_m: float = 0.0
     excluded: GroundMask | None = None
 
@@ -172,7 +171,7 @@ def height_errors(
 
     Args:
         points: of a block.
-        model: heights, with their sigma.
+        model: heights.
         compared: which height; by default that of the surface if any point states it, else that of the
             point.
     """
@@ -203,7 +202,7 @@ def height_errors(
         row=rows,
         lon_lat=lon_lat[rows],
         error_m=error_m[rows],
-        variance_m2=variance_m2[rows] + along_slope + model.sigma_m**2,
+        variance_m2=variance_m2[rows] + along_slope + model.terrain.sigma_m(lon_lat[rows]) ** 2,
         compared=compared,
         unstated=int((~stated).sum()),
         excluded=int((covered & stated).sum()),

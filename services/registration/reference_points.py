@@ -23,12 +23,13 @@ def reference_points(
     """
     n = len(lon_lat_h)
     unknown = np.full(n, np.nan)
-    variance = np.array([reference.sigma_m, reference.sigma_m, reference.height_sigma_m]) ** 2
+    covariance_m2 = np.tile(np.eye(3) * reference.sigma_m**2, (n, 1, 1))
+    covariance_m2[:, 2, 2] = reference.height_sigma_m(lon_lat_h) ** 2
     rows = np.arange(n)
     return ControlPoints(
         id=rows,
         lon_lat_h=lon_lat_h,
-        covariance_m2=np.tile(np.diag(variance), (n, 1, 1)),
+        covariance_m2=covariance_m2,
         block=np.zeros(n, dtype=np.int64),
         frames=(reference.frame,),
         saliency=np.ones(n),

@@ -20,13 +20,11 @@ class ErrorSources:
         registration: of the model; None for a scene that is not registered.
         model_sigma_m: accuracy on the Earth of a model that is not registered, one standard deviation a
             coordinate; NaN when unknown.
-        height_sigma_m: one standard deviation of the heights of the terrain.
         vertex_sigma_px: one standard deviation of each coordinate of a digitised vertex.
     """
 
     registration: CorrectionAccuracy | None
     model_sigma_m: float
-    height_sigma_m: float
     vertex_sigma_px: float
 
 
@@ -66,7 +64,7 @@ def predict_vertices(
 
     Args:
         model: of the image.
-        terrain: the ground.
+        terrain: the ground, with the sigma of its heights.
         line_sample: (n, 2) the vertices in the image.
         lon_lat_h: (n, 3) the same on the ground.
         sources: of the errors.
@@ -76,7 +74,8 @@ def predict_vertices(
     slope = np.nan_to_num(terrain.slope(lon_lat_h))
     to_image = horizontal + vertical * slope[:, None, :]
     own_px2 = sources.vertex_sigma_px**2 * np.eye(2)
-    own_px2 = own_px2 + sources.height_sigma_m**2 * _outer(vertical)
+    height_m2 = terrain.sigma_m(lon_lat_h) ** 2
+    own_px2 = own_px2 + height_m2[:, None, None] * _outer(vertical)
     if sources.registration is None:
         relative_px2 = np.full_like(own_px2, np.nan)
         earth_px2 = own_px2 + sources.model_sigma_m**2 * _outer(horizontal)

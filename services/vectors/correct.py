@@ -31,6 +31,7 @@ class CorrectedVectors:
         accuracy: of the vertices.
         missed: (n,) geometries with a place that meets no ground.
         added: vertices that were added to edges.
+        height_sigma_m: of the heights of the terrain there, the median; NaN without any.
     """
 
     shapes: Shapes
@@ -38,6 +39,7 @@ class CorrectedVectors:
     accuracy: VertexAccuracy
     missed: BoolArray
     added: int
+    height_sigma_m: float
 
 
 def correct_vectors(
@@ -82,11 +84,12 @@ def correct_vectors(
     curves = curved(shapes, Transformation(ground, pieces, finest, tolerance))
     line_sample, met = curves.source.vertices, curves.target.vertices[:, 2:]
     known = np.asarray(np.isfinite(met).all(axis=1))
-    accuracy = _unknown_accuracy(len(met))
+    accuracy, height_sigma_m = _unknown_accuracy(len(met)), math.nan
     if known.any():
         predicted = predict_vertices(scene.model, terrain, line_sample[known], met[known], sources)
         accuracy.relative_m2[known] = predicted.relative_m2
         accuracy.on_the_earth_m2[known] = predicted.on_the_earth_m2
+        height_sigma_m = float(np.median(terrain.sigma_m(met[known])))
     height_m = met[:, 2].copy()
     if terrain.geoid is not None and not has_heights(crs) and known.any():
         height_m[known] -= terrain.geoid(met[known, :2])
@@ -96,6 +99,7 @@ def correct_vectors(
         accuracy,
         curves.broken | curves.source.having(~known),
         len(curves.source.index) - len(shapes.index),
+        height_sigma_m,
     )
 
 

@@ -143,9 +143,7 @@ def test_a_scene_with_saturated_pixels_is_registered_on_a_reference_as_without(
             for seed, path in enumerate((june, may))
         ]
         held, scene = (cropped(read_scene(path, sigma_m=30.0)) for path in paths)
-        reference = Reference(
-            held.image, held.model, None, sigma_m=1.0, height_sigma_m=5.0, common_sigma_m=0.5
-        )
+        reference = Reference(held.image, held.model, None, sigma_m=1.0, common_sigma_m=0.5)
         registrations.append(register_on_reference(scene, reference))
     assert_alike(*registrations)
 

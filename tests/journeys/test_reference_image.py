@@ -35,7 +35,7 @@ def ortho(path: Path) -> tuple[ImageSource, OrthoModel]:
 
 def registered(reference: Path, scene: Path, sigma_m: float) -> tuple[Registration, OrthoModel]:
     image, model = ortho(reference)
-    held = Reference(image, model, None, sigma_m=1.0, height_sigma_m=5.0, common_sigma_m=0.5)
+    held = Reference(image, model, None, sigma_m=1.0, common_sigma_m=0.5)
     scene_image, scene_model = ortho(scene)
     registration = register_on_reference(
         Scene(scene_image, scene_model, Acquisition(scene.stem), sigma_m), held

@@ -13,7 +13,7 @@ from amers.app.errors import InputError
 from amers.app.usecases.registration.reference_source import ReferenceFiles, read_reference
 from amers.app.usecases.registration.result_folder import replacing
 from amers.app.usecases.report_files import write_report
-from amers.app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
+from amers.app.usecases.terrain_file import TerrainFile, read_terrain
 from amers.services.formats.block.check import check_block
 from amers.services.formats.block.document import BlockMetadata
 from amers.services.formats.block.reader import FolderChips, block_member
@@ -50,8 +50,8 @@ class HeightFiles:
 
     Attributes:
         terrain: a terrain or surface model.
-        sigma_m: of its heights, one standard deviation, independent from point to point; by default a
-            tenth of the distance of its nodes.
+        sigma_m: of its heights, one standard deviation, independent from point to point; by default
+            that of each cell of a surface, else a tenth of the distance of its nodes.
         frame_sigma_m: of the error that all its heights share; None when unknown.
         excluded: masks of ground where its heights are not to be trusted.
         land_cover: image on a map with the classes of the ground.
@@ -235,15 +235,10 @@ def _measure_heights(
     points: ControlPoints, files: HeightFiles, stated: list[Statements]
 ) -> tuple[HeightQuality, HeightErrors]:
     """The heights of points against a height model; what its files state is added to `stated`."""
-    terrain = read_terrain(files.terrain)
+    terrain = read_terrain(files.terrain, files.sigma_m)
     masks = [read_ground_mask(path) for path in files.excluded]
     stated.extend([terrain.statements, *(mask.statements for mask in masks)])
-    model = HeightModel(
-        terrain,
-        files.sigma_m or HEIGHT_SIGMA_POSTINGS * terrain.posting_m,
-        files.frame_sigma_m or 0.0,
-        any_of([*masks]),
-    )
+    model = HeightModel(terrain, files.frame_sigma_m or 0.0, any_of([*masks]))
     errors = compare_heights(points, model)
     cover = None
     if files.land_cover is not None:

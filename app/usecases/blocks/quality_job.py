@@ -43,8 +43,8 @@ class AssessBlock:
         dem: heights that those of the points are compared with.
         vertical: vertical datum of these heights, where the file does not state it.
         geoid: grid file of the geoid, where PROJ has none.
-        dem_sigma_m: of the heights, one standard deviation; by default a tenth of the distance of the
-            nodes.
+        dem_sigma_m: of the heights, one standard deviation; by default that of each cell of a surface,
+            else a tenth of the distance of the nodes.
         dem_frame_sigma_m: of the error that all the heights share; unknown by default.
         exclude: masks of ground where no points are expected: GeoJSON, or images on a map, not 0 there.
         exclude_heights: masks of ground where the heights are not to be trusted.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from amers.app.errors import InputError
 from amers.app.usecases.registration.control_sources import ControlSet
-from amers.app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
+from amers.app.usecases.terrain_file import TerrainFile, read_terrain
 from amers.services.formats.images.map_statements import map_statements, unused_heights
 from amers.services.formats.images.raster import (
     RasterImage,
@@ -31,8 +31,6 @@ LOCAL_SIGMA_PX = 0.3
 """Assumed local error of an ortho-image, independent between places: one sigma, in its own pixels."""
 COMMON_SIGMA_PX = 0.1
 """Assumed error that all places share, from shadows and leaning roofs: one sigma, in its own pixels."""
-NO_HEIGHT_SIGMA_M = 5000.0
-"""Sigma of unknown heights: land reaches from -430 to 8,850 m."""
 
 
 @dataclass(frozen=True)
@@ -137,17 +135,12 @@ def read_reference(files: ReferenceFiles) -> Reference:
     shift = shift_of_grid(image, grid)
     model = OrthoModel(grid)
     gsd_m = grid.gsd_m
-    terrain = None
-    height_sigma_m = NO_HEIGHT_SIGMA_M
-    if files.terrain is not None:
-        terrain = read_terrain(files.terrain)
-        height_sigma_m = HEIGHT_SIGMA_POSTINGS * terrain.posting_m
+    terrain = None if files.terrain is None else read_terrain(files.terrain)
     return Reference(
         image=image,
         model=model,
         terrain=terrain,
         sigma_m=LOCAL_SIGMA_PX * gsd_m,
-        height_sigma_m=height_sigma_m,
         common_sigma_m=COMMON_SIGMA_PX * gsd_m,
         frame=Frame.from_sigmas(
             math.nan if files.sigma_m is None else math.hypot(files.sigma_m, shift.sigma_m),

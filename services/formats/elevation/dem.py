@@ -1,5 +1,6 @@
 """Reading digital elevation models as terrain with heights above the WGS 84 ellipsoid."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,8 @@ def read_dem(
 ) -> Terrain:
     """The terrain in a file, or in many tiles; files stay open and are read by windows.
 
+    A surface brings the standard deviation of each of its heights.
+
     Args:
         path: GeoTIFF (or COG), JPEG 2000 or NITF with any reference system; any other file of
             `amers.services.formats.elevation.grid_files`; a folder of them; or a text file `.txt` with
@@ -51,13 +54,16 @@ def read_dem(
         tile = read_tile(path, caller, images_only=images_only)
         grid, statements = tile.grid, tile.statements
         heights: ImageSource = tile.heights
+        sigmas: ImageSource | None = tile.sigmas
     else:
         tile, grid, heights, statements = mosaic_of(path, tiles, caller)
+        sigmas = replace(heights, has_sigmas=True) if tile.sigmas else None
     note = tile.datum.origin
     if fill_px > 0:
         heights = FilledVoids(heights, fill_px)
+        sigmas = sigmas and FilledVoids(sigmas, fill_px)
         note += f"; voids filled from heights within {fill_px} nodes"
-    terrain = Terrain(grid, heights, tile.datum.zero_m, note, gathered(statements))
+    terrain = Terrain(grid, heights, tile.datum.zero_m, note, gathered(statements), sigmas)
     if terrain.geoid is not None:
         _check_geoid_coverage(tile, terrain.geoid, path)
     return terrain

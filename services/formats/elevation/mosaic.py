@@ -10,8 +10,8 @@ import numpy as np
 from amers.services.datums import DatumShift
 from amers.services.errors import FormatError, VerticalDatumError
 from amers.services.formats.elevation.heights import HeightDatum, HeightsByCaller
-from amers.services.formats.elevation.tiles import Heights, HeightTile, read_tile
-from amers.services.imagery.source import ImageSource, Window
+from amers.services.formats.elevation.tiles import Heights, HeightTile, Sigmas, read_tile
+from amers.services.imagery.source import Window
 from amers.services.map_grid import MapGrid
 from amers.services.statements import Statements
 from amers.services.terrain import Terrain
@@ -45,7 +45,7 @@ class _Place:
 
 @dataclass
 class Mosaic:
-    """Heights of many tiles on one grid, metres; an `ImageSource`.
+    """Heights of many tiles on one grid, or their standard deviations, metres; an `ImageSource`.
 
     Where tiles overlap, the first with a height there counts.
 
@@ -54,13 +54,17 @@ class Mosaic:
         grid: common to all tiles.
         places: of the tiles, in their order.
         caller: what the caller states of all of them.
+        has_sigmas: it has the standard deviations of surfaces, in place of their heights.
     """
 
     shape: tuple[int, int]
     grid: MapGrid
     places: tuple[_Place, ...]
     caller: HeightsByCaller
-    _open: OrderedDict[Path, Heights] = field(default_factory=OrderedDict, repr=False, compare=False)
+    has_sigmas: bool = False
+    _open: OrderedDict[Path, Heights | Sigmas] = field(
+        default_factory=OrderedDict, repr=False, compare=False
+    )
 
     def read(self, window: Window) -> FloatImage:
         """Heights of a window; NaN where no tile has any."""
@@ -92,21 +96,22 @@ class Mosaic:
     def _of_tile(self, place: _Place, low: IntArray, high: IntArray) -> FloatImage:
         """Heights of a tile at the nodes of the common grid from `low` to before `high`."""
         lines, samples = (int(size) for size in high - low)
-        heights = self._heights(place.path)
+        values = self._values(place.path)
         if place.is_aligned:
             line, sample = (int(node) for node in low - place.low)
-            return heights.read(Window(line, sample, lines, samples))
+            return values.read(Window(line, sample, lines, samples))
         nodes = np.indices((lines, samples)).reshape(2, -1).T + low
         # In the vertical datum of the tile, which is that of all.
-        terrain = Terrain(place.grid, heights)
+        terrain = Terrain(place.grid, values)
         height_m = terrain.height_m(self.grid.lon_lat(nodes.astype(np.float64)))
         return height_m.reshape(lines, samples).astype(np.float32)
 
-    def _heights(self, path: Path) -> Heights:
+    def _values(self, path: Path) -> Heights | Sigmas:
         if path in self._open:
             self._open.move_to_end(path)
         else:
-            self._open[path] = read_tile(path, self.caller).heights
+            tile = read_tile(path, self.caller)
+            self._open[path] = tile.sigmas if self.has_sigmas and tile.sigmas else tile.heights
             while len(self._open) > MOST_OPEN:
                 self._open.popitem(last=False)[1].close()
         return self._open[path]
@@ -114,7 +119,7 @@ class Mosaic:
 
 def mosaic_of(
     path: Path, files: list[Path], caller: HeightsByCaller
-) -> tuple[HeightTile, MapGrid, ImageSource, Statements]:
+) -> tuple[HeightTile, MapGrid, Mosaic, Statements]:
     """Many files of heights on the lattice of the finest of them.
 
     Args:
@@ -123,7 +128,8 @@ def mosaic_of(
         caller: what the caller states of all of them.
 
     Returns:
-        The tile whose lattice it is, the common grid, the heights, and the statements of all files.
+        The tile whose lattice it is, with sigmas only where all tiles have them, the common grid, the
+        heights, and the statements of all files.
 
     Raises:
         FormatError, VerticalDatumError: a file cannot be used, two files cover the same ground, or their
@@ -136,6 +142,8 @@ def mosaic_of(
         tiles[file].heights.close()
     _check_alike(path, tiles)
     finest = min(tiles.values(), key=lambda tile: tile.grid.gsd_m)
+    if not all(tile.sigmas for tile in tiles.values()):
+        finest = replace(finest, sigmas=None)
     lattice = finest.grid
     reaches = [_reach(lattice, tile.grid) for tile in tiles.values()]
     low = np.min([first for first, _ in reaches], axis=0)

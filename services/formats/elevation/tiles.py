@@ -10,8 +10,10 @@ from amers.services.datums import DatumShift
 from amers.services.errors import AmersError, FormatError
 from amers.services.formats.elevation.grid_files import HEIGHTS_OF_FORMAT, HeightsImage, open_heights
 from amers.services.formats.elevation.heights import HeightDatum, HeightsByCaller, height_datum
+from amers.services.formats.images.bands import one_band
 from amers.services.formats.images.map_statements import map_statements
 from amers.services.formats.images.raster import map_grid_of, shift_of_grid
+from amers.services.formats.images.surfaces import BANDS
 from amers.services.imagery.source import Window
 from amers.services.map_grid import MapGrid
 from amers.services.statements import Statement, Statements, Subject, Use
@@ -32,12 +34,14 @@ class HeightTile:
         heights: metres in the vertical datum, NaN in voids.
         datum: unit and vertical datum.
         statements: of the file.
+        sigmas: one standard deviation of the heights, metres; None where the file is no surface.
     """
 
     grid: MapGrid
     heights: "Heights"
     datum: HeightDatum
     statements: Statements
+    sigmas: "Sigmas | None" = None
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,26 @@ class Heights:
             void |= (heights < HEIGHTS_M[0]) | (heights > HEIGHTS_M[1])
         heights[void] = np.nan
         return heights
+
+    def close(self) -> None:
+        """Close the file."""
+        self.image.close()
+
+
+@dataclass(frozen=True)
+class Sigmas:
+    """The standard deviations of the heights of a surface, metres; an `ImageSource`."""
+
+    image: HeightsImage
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Lines and samples."""
+        return self.image.shape
+
+    def read(self, window: Window) -> FloatImage:
+        """Standard deviations of a window; NaN outside the file and where there is no height."""
+        return self.image.with_mix(one_band(2)).read(window)
 
     def close(self) -> None:
         """Close the file."""
@@ -110,7 +134,13 @@ def read_tile(
         *of_datum,
         *_of_values(image),
     )
-    return HeightTile(grid, Heights(image, datum.unit_m), datum, statements)
+    sigmas = Sigmas(image) if _is_surface(image) else None
+    return HeightTile(grid, Heights(image, datum.unit_m), datum, statements, sigmas)
+
+
+def _is_surface(image: HeightsImage) -> bool:
+    """Whether the second band states the standard deviations of the first one."""
+    return image.dataset.descriptions[:2] == BANDS[:2]
 
 
 def _datums(
@@ -153,7 +183,11 @@ def _of_values(image: HeightsImage) -> Statements:
     if (image.scale, image.offset) != (1.0, 0.0):
         value = f"scale {image.scale:g}, offset {image.offset:g}"
         others.append(replace(used, value=value))
-    if dataset.count > 1:
-        value = f"bands 2 to {dataset.count}"
+    first_other = 2
+    if _is_surface(image):
+        first_other = 3
+        others.append(Statement(name, Subject.BANDS, Use.USED, "sigma of the heights", "band 2"))
+    if dataset.count >= first_other:
+        value = f"bands {first_other} to {dataset.count}"
         others.append(Statement(name, Subject.BANDS, Use.NOT_USED, value, note="heights are band 1"))
     return tuple(others)

@@ -34,7 +34,7 @@ def ground(west: float, east: float) -> ControlHeights:
     heights = 500.0 + np.where(along_m < 0.0, west, east) * along_m
     pixels = np.tile(heights, (SIDE, 1)).astype(np.float32)
     frame = Frame.from_sigmas(*DEM_FRAME_M)
-    return ControlHeights("dem", Terrain(GRID, ArrayImage(pixels)), DEM_SIGMA_M, frame)
+    return ControlHeights("dem", Terrain(GRID, ArrayImage(pixels), sigmas=DEM_SIGMA_M), frame)
 
 
 def places() -> Array:
@@ -104,8 +104,9 @@ def test_ground_that_is_no_plane_is_as_uncertain_as_it_deviates_from_one() -> No
     grid = replace(GRID, step_xy=np.array([[0.0, posting_m], [-posting_m, 0.0]]))
     along_m = np.arange(SIDE) * posting_m
     wave_m = 500.0 + amplitude_m * np.sin(2.0 * np.pi * along_m / length_m)
-    terrain = Terrain(grid, ArrayImage(np.tile(wave_m, (SIDE, 1)).astype(np.float32)))
-    heights = ControlHeights("dem", terrain, DEM_SIGMA_M, Frame.from_sigmas(*DEM_FRAME_M))
+    pixels = np.tile(wave_m, (SIDE, 1)).astype(np.float32)
+    terrain = Terrain(grid, ArrayImage(pixels), sigmas=DEM_SIGMA_M)
+    heights = ControlHeights("dem", terrain, Frame.from_sigmas(*DEM_FRAME_M))
     sample = np.linspace(100.0, 300.0, 57)
     lon_lat = grid.lon_lat(np.column_stack([np.full(57, 200.0), sample]))
     points = np.column_stack([lon_lat, np.zeros(57)])

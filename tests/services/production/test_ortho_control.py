@@ -60,8 +60,8 @@ def heights(seed: int, bias_m: float = 0.0, wrong: BoolArray | None = None) -> C
     off = replace(nodes, origin_xy=nodes.origin_xy + rng.normal(0.0, DEM_FRAME_M[0], 2))
     if wrong is not None:
         height_m[wrong] += 40.0
-    terrain = Terrain(off, ArrayImage(height_m.astype(np.float32)))
-    return ControlHeights("dem.tif", terrain, DEM_SIGMA_M, Frame.from_sigmas(*DEM_FRAME_M))
+    terrain = Terrain(off, ArrayImage(height_m.astype(np.float32)), sigmas=DEM_SIGMA_M)
+    return ControlHeights("dem.tif", terrain, Frame.from_sigmas(*DEM_FRAME_M))
 
 
 @cache

@@ -89,7 +89,7 @@ def test_points_have_the_height_of_the_ground_and_the_stated_sigmas() -> None:
     assert (points.lon_lat_h[:, 2] == FLAT.flat_m).all()
     sigma_m = np.sqrt(np.diagonal(points.covariance_m2, 0, 1, 2))
     np.testing.assert_allclose(sigma_m[:, :2], 0.3 * GSD_M, rtol=1e-3)
-    np.testing.assert_allclose(sigma_m[:, 2], FLAT.sigma_m)
+    np.testing.assert_allclose(sigma_m[:, 2], FLAT.flat_sigma_m)
 
 
 def test_chips_are_complete_and_show_the_image() -> None:
@@ -122,7 +122,7 @@ def test_missing_pixels_and_unknown_heights_give_no_points() -> None:
     heights = np.full((SIDE, SIDE), 40.0, dtype=np.float32)
     heights[: SIDE // 2] = np.nan
     grid = scene.model.grid  # type: ignore[attr-defined]
-    known = GroundHeights(Terrain(grid, ArrayImage(heights)), 0.0, 3.0)
+    known = GroundHeights(Terrain(grid, ArrayImage(heights), sigmas=3.0))
     points = produce_ortho_points([scene], known, replace(OPTIONS, points=100)).points
     seen = scene.model.project(points.lon_lat_h)
     # At most a tenth of a chip is missing.
@@ -164,7 +164,7 @@ def test_the_height_of_the_surface_is_unknown() -> None:
     grid = ortho(land()).model.grid  # type: ignore[attr-defined]
     heights = ArrayImage(np.full((SIDE, SIDE), 40.0, dtype=np.float32))
     points = produce_ortho_points(
-        [ortho(land())], GroundHeights(Terrain(grid, heights), 0.0, 3.0)
+        [ortho(land())], GroundHeights(Terrain(grid, heights, sigmas=3.0))
     ).points
     assert points.surface is None
 

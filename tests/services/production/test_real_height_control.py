@@ -48,9 +48,8 @@ def test_the_heights_of_a_pair_become_those_of_the_model(real_data: Path, pair) 
     folder = real_data / "phr_calanques_triplet"
     dsm = folder / "expected_output" / "dsm.tif"
     scenes = [replace(scene, sigma_m=PLEIADES_SIGMA_M) for scene in read_triplet(folder, pair)]
-    heights = ControlHeights(
-        "dsm.tif", read_dem(dsm, "ellipsoid"), DSM_SIGMA_M, Frame.from_sigmas(*DSM_FRAME_M)
-    )
+    terrain = replace(read_dem(dsm, "ellipsoid"), sigmas=DSM_SIGMA_M)
+    heights = ControlHeights("dsm.tif", terrain, Frame.from_sigmas(*DSM_FRAME_M))
     free = produce_points(scenes, OPTIONS)
     placed = produce_points(scenes, OPTIONS, control=Control(heights=(heights,)))
     before_m, after_m = (height_bias_m(made, scenes, dsm) for made in (free, placed))

@@ -58,7 +58,7 @@ def test_honest_points_are_found_honest_on_flat_and_on_steep_ground(rise):
     terrain = sloping_terrain(rise)
     points = with_errors(true_points(terrain, 4000, Frame.from_sigmas(1.0, 2.0)), rng)
     points.lon_lat_h[:, 2] += rng.normal(0.0, sigma_m, len(points))
-    model = HeightModel(terrain, sigma_m)
+    model = HeightModel(replace(terrain, sigmas=sigma_m))
     quality = height_quality(height_errors(points, model), points, model, "a slope")
     assert quality.normalised.lower < quality.normalised.mean_square < quality.normalised.upper
     assert_allclose(quality.typical_ratio, 1.0, atol=five_percent)
@@ -75,7 +75,7 @@ def test_the_variance_of_a_height_is_that_of_the_way_from_the_slope_to_the_point
     points = true_points(terrain, 50, Frame.from_sigmas(1.0, 2.0))
     root = np.random.default_rng(15).normal(size=(50, 3, 3))
     points = replace(points, covariance_m2=root @ root.transpose(0, 2, 1))
-    errors = height_errors(points, HeightModel(terrain, sigma_m))
+    errors = height_errors(points, HeightModel(replace(terrain, sigmas=sigma_m)))
     assert_allclose(terrain.slope(points.lon_lat_h)[:, 0], rise, rtol=0.01)
     off = np.column_stack([-terrain.slope(points.lon_lat_h), np.ones(50)])
     beside = (root.transpose(0, 2, 1) @ off[:, :, None])[:, :, 0]
@@ -88,7 +88,7 @@ def test_bias_spread_and_le90_put_in_are_found_and_the_frame_is_judged_by_its_ow
     points = true_points(terrain, 5000, Frame.from_sigmas(1.0, 2.0))
     error_m = rng.normal(0.0, 0.8, len(points))
     points.lon_lat_h[:, 2] += 1.5 + error_m
-    model = HeightModel(terrain, 0.8)
+    model = HeightModel(replace(terrain, sigmas=0.8))
     quality = height_quality(height_errors(points, model), points, model, "flat")
     on_earth, relative = quality.on_the_earth, quality.relative
     assert_allclose([on_earth.bias_m, on_earth.median_m], 1.5, atol=five_percent)
@@ -110,7 +110,7 @@ def test_a_degree_cell_and_a_land_cover_with_larger_errors_are_told_apart():
     points = true_points(terrain, 2000, Frame.from_sigmas(1.0, 2.0))
     east = points.lon_lat_h[:, 0] >= 6.0
     points.lon_lat_h[:, 2] += np.where(east, 4.0, 0.0) + rng.normal(0.0, 0.5, len(points))
-    model = HeightModel(terrain, 0.5)
+    model = HeightModel(replace(terrain, sigmas=0.5))
     errors = height_errors(points, model)
     cover = ["forest" if lon >= 6.0 else "fields" for lon in errors.lon_lat[:, 0].tolist()]
     quality = height_quality(errors, points, model, "flat", cover)
@@ -131,7 +131,7 @@ def test_where_a_block_states_surfaces_they_are_compared_and_its_points_told_apa
     stated = np.arange(300) % 3 == 0
     surface_m = np.where(stated, 100.25, np.nan)
     points = replace(points, surface=SurfaceHeights(surface_m, np.where(stated, 0.3, np.nan)))
-    model = HeightModel(terrain, 0.4)
+    model = HeightModel(replace(terrain, sigmas=0.4))
     errors = height_errors(points, model)
     assert (errors.compared, errors.unstated, len(errors.row)) == ("surface", 200, 100)
     assert_allclose(errors.error_m, 0.25, atol=a_millimetre)
@@ -150,7 +150,7 @@ def test_excluded_ground_and_ground_without_heights_are_counted_apart():
     def town(lon_lat: Array) -> np.ndarray:
         return lon_lat[:, 1] > 43.5
 
-    errors = height_errors(points, HeightModel(terrain, 0.5, excluded=town))
+    errors = height_errors(points, HeightModel(replace(terrain, sigmas=0.5), excluded=town))
     beyond = (points.lon_lat_h[:, 0] > 6.61) & (points.lon_lat_h[:, 1] <= 43.5)
     assert errors.excluded == (points.lon_lat_h[:, 1] > 43.5).sum()
     assert errors.outside >= beyond.sum() > 0
@@ -160,7 +160,7 @@ def test_excluded_ground_and_ground_without_heights_are_counted_apart():
 def test_no_height_at_all_gives_no_figures_and_no_error():
     far = sloping_terrain(box=(50.0, 43.0, 50.5, 43.5))
     points = true_points(sloping_terrain(), 20, Frame.from_sigmas(1.0, 2.0))
-    model = HeightModel(far, 0.5)
+    model = HeightModel(replace(far, sigmas=0.5))
     quality = height_quality(height_errors(points, model), points, model, "elsewhere")
     assert (quality.outside, quality.on_the_earth.n, quality.cells) == (20, 0, ())
     assert np.isnan(quality.on_the_earth.le90_m.value)

@@ -116,7 +116,7 @@ def test_heights_are_judged_on_the_earth_with_the_error_that_all_points_share() 
     lon_lat_h = points.lon_lat_h.copy()
     lon_lat_h[:, 2] = terrain.height_m(lon_lat_h) + 5.0 + rng.normal(0.0, 0.1, 400)
     points = replace(points, lon_lat_h=lon_lat_h)
-    model = HeightModel(terrain, 0.1)
+    model = HeightModel(replace(terrain, sigmas=0.1))
     heights = height_quality(height_errors(points, model), points, model, "flat")
     for limit_m, outcome in ((1.0, "missed"), (6.0, "met")):
         criteria = block_criteria(BlockRequirements(le90_m=limit_m), PLENTY, 3, heights, ())

@@ -50,7 +50,7 @@ def positions(of: MapGrid) -> np.ndarray:
 def terrain() -> Terrain:
     nodes = grid(POSTING_M)
     heights = world().height_m(nodes.lon_lat(positions(nodes).astype(float)))
-    return Terrain(nodes, ArrayImage(heights.reshape(nodes.shape).astype(np.float32)))
+    return Terrain(nodes, ArrayImage(heights.reshape(nodes.shape).astype(np.float32)), sigmas=1.0)
 
 
 @cache
@@ -62,9 +62,7 @@ def reference() -> Reference:
     view = block_views()[0]
     seen = view.geometry.true_model.project(ground).reshape(*pixels.shape, 2)
     image = ArrayImage(sample_image(view.image, seen, 1.0))
-    return Reference(
-        image, OrthoModel(pixels), terrain(), sigma_m=0.3, height_sigma_m=1.0, common_sigma_m=0.15
-    )
+    return Reference(image, OrthoModel(pixels), terrain(), sigma_m=0.3, common_sigma_m=0.15)
 
 
 @cache

@@ -24,7 +24,7 @@ SIGMA_M = 25.0
 
 def reference() -> Reference:
     image = whole()
-    return Reference(image.image, image.model, None, sigma_m=0.3, height_sigma_m=1.0, common_sigma_m=0.1)
+    return Reference(image.image, image.model, None, sigma_m=0.3, common_sigma_m=0.1)
 
 
 def registered(of: Scene, options: RegistrationOptions = OPTIONS) -> Registration:

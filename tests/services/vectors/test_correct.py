@@ -24,7 +24,7 @@ from tests.services.vectors_world import CRS, DEM, GSD_M, SHAPE, heights, image_
 a_millimetre = 1e-3
 a_thousandth_of_a_pixel = 1e-3
 the_tolerance_px = 0.2
-NOTHING_KNOWN = ErrorSources(None, np.nan, 0.0, 0.0)
+NOTHING_KNOWN = ErrorSources(None, np.nan, 0.0)
 
 
 def corrected(geometries: Geometries, ground: Terrain, tolerance_px: float = 0.2) -> CorrectedVectors:
@@ -198,10 +198,10 @@ def registered(frame: Frame = UNKNOWN_FRAME) -> CorrectionAccuracy:
 def test_the_stated_precision_is_honest() -> None:
     """Draws of all errors: of the model, the frame, the heights of the terrain and the operator."""
     rng = np.random.default_rng(7)
-    ground, view = terrain(30.0), scene()
+    ground, view = replace(terrain(30.0), sigmas=3.0), scene()
     frame = Frame(np.array([[1.5, 0.4, 0.0], [0.4, 2.0, 0.3], [0.0, 0.3, 4.0]]))
     accuracy = registered(frame)
-    sources = ErrorSources(accuracy, np.nan, 3.0, 0.5)
+    sources = ErrorSources(accuracy, np.nan, 0.5)
     line_sample = image_places(12, seed=6)
     met = intersect_terrain(view.model, line_sample, ground)
     stated = predict_vertices(view.model, ground, line_sample, met, sources)
@@ -238,7 +238,9 @@ def test_on_level_ground_a_height_error_moves_a_vertex_by_the_tangent_of_the_inc
     line_sample = np.array([[SHAPE[0] / 2.0, SHAPE[1] / 2.0]])
     met = intersect_terrain(view.model, line_sample, ground)
     stated, without = (
-        predict_vertices(view.model, ground, line_sample, met, ErrorSources(registered(), 0.0, m, 0.0))
+        predict_vertices(
+            view.model, replace(ground, sigmas=m), line_sample, met, ErrorSources(registered(), 0.0, 0.0)
+        )
         for m in (10.0, 0.0)
     )
     of_height = (stated.relative_m2 - without.relative_m2)[0]
@@ -253,13 +255,15 @@ def test_what_nobody_stated_is_unknown() -> None:
         stated = predict_vertices(scene().model, terrain(), line_sample, met, sources)
         return stated.relative_ce90_m, stated.on_the_earth_ce90_m
 
-    relative, earth = ce90(ErrorSources(registered(), np.nan, 1.0, 0.5))
+    relative, earth = ce90(ErrorSources(registered(), np.nan, 0.5))
     assert np.isfinite(relative).all()
     assert np.isnan(earth).all()
-    relative, earth = ce90(ErrorSources(None, 5.0, 0.0, 0.0))
+    relative, earth = ce90(ErrorSources(None, 5.0, 0.0))
     assert np.isnan(relative).all()
-    of_model = ErrorSources(None, 5.0, 0.0, 0.0)
-    level = predict_vertices(scene().model, terrain(0.0), line_sample, met, of_model)
+    of_model = ErrorSources(None, 5.0, 0.0)
+    level = predict_vertices(
+        scene().model, replace(terrain(0.0), sigmas=0.0), line_sample, met, of_model
+    )
     np.testing.assert_allclose(level.on_the_earth_ce90_m, 5.0 * 2.146, rtol=1e-3)
 
 
@@ -288,8 +292,8 @@ def test_on_sloping_ground_errors_move_a_vertex_as_its_line_of_sight_meets_the_s
         (0.0, 2.0): 4.0 * outer(by_height),
     }
     for (vertex_px, height_sigma_m), of_errors in expected_m2.items():
-        sources = ErrorSources(None, 0.0, height_sigma_m, vertex_px)
-        terrain_of = Terrain(DEM, ArrayImage(plane))
+        sources = ErrorSources(None, 0.0, vertex_px)
+        terrain_of = Terrain(DEM, ArrayImage(plane), sigmas=height_sigma_m)
         stated = predict_vertices(view.model, terrain_of, line_sample, ground, sources)
         tolerance = 0.02 * np.abs(of_errors).max()
         np.testing.assert_allclose(stated.on_the_earth_m2, of_errors, atol=tolerance)

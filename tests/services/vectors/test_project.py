@@ -111,7 +111,7 @@ def test_vectors_with_heights_return_to_the_image_they_were_corrected_from(crs: 
     over = replace(terrain(), geoid=lambda lon_lat: 40.0 + 10.0 * lon_lat[:, 0])
     points = shapes_of(shapely.points(image_places(20)))
     there = correct_vectors(
-        points, scene(), over, crs, sources=ErrorSources(None, np.nan, 0.0, 0.0), tolerance_px=0.2
+        points, scene(), over, crs, sources=ErrorSources(None, np.nan, 0.0), tolerance_px=0.2
     )
     back = project_vectors(there.shapes, scene(), over, crs, tolerance_px=0.2)
     np.testing.assert_allclose(back.shapes.vertices, there.line_sample, atol=0.01)
