@@ -1,6 +1,6 @@
-"""The options that state the control of a block."""
+"""The options that state the control of a block, and the marks that a scene is registered on."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from amers.app.cli.options import FromMilli, GeoidFile, option_name
@@ -8,7 +8,55 @@ from amers.app.cli.point_statements import sigma_pair, stated_by_caller
 from amers.app.errors import InputError
 from amers.app.usecases.control_files import ControlFiles, HeightFile
 from amers.app.usecases.marked_files import PointStatements
+from amers.app.usecases.registration.control_marks import MarkFiles
 from amers.app.usecases.terrain_file import TerrainFile
+
+
+@dataclass(frozen=True)
+class MarkOptions:
+    """Ground points that a person marked in a scene.
+
+    Attributes:
+        control: file of ground points marked in the scene (CSV, ASP, OPF, GeoJSON, ODM, QGIS, ENVI,
+            PCI); repeat for several.
+        control_sigma_m: accuracy of marked ground whose file states none: HORIZONTAL,UP, one sigma,
+            metres; by default one pixel.
+        control_frame_sigma_m: error on the Earth that all marked ground shares: HORIZONTAL,UP, one
+            sigma, metres.
+        control_mark_sigma_px: sigma of marks whose file states none, pixels; by default 0.5.
+        control_vertical: vertical datum of marked ground: ellipsoid, EGM96, EGM2008, EPSG:…
+        control_geoid: grid file of its geoid, GTX or GeoTIFF.
+        control_crs: reference system of x and y of a CSV, such as EPSG:32633.
+        control_columns: columns of a CSV of other names: lon=COLUMN,lat=COLUMN,…
+        control_sigma_axes: axes of the sigmas of an ASP file: ecef or lat-lon-height.
+    """
+
+    control: tuple[Path, ...] = ()
+    control_sigma_m: str | None = None
+    control_frame_sigma_m: str | None = None
+    control_mark_sigma_px: FromMilli = None
+    control_vertical: str | None = None
+    control_geoid: GeoidFile = None
+    control_crs: str | None = None
+    control_columns: str | None = None
+    control_sigma_axes: str | None = None
+
+    def files(self) -> MarkFiles | None:
+        """The files of the marks, with what the options state about them; None without any.
+
+        Raises:
+            InputError: a value is wrong, or states something of a file that is not given.
+        """
+        if self.control:
+            return MarkFiles(self.control, _point_statements(self))
+        alone = [
+            option_name(field.name)
+            for field in fields(self)
+            if field.name != "control" and getattr(self, field.name) is not None
+        ]
+        if alone:
+            raise InputError(f"{', '.join(alone)}: of --control, which is missing; add it")
+        return None
 
 
 @dataclass(frozen=True)
@@ -64,22 +112,9 @@ class ControlOptions:
         """
         self._refuse_alone("control_dem", "vertical", "geoid", "sigma_m", "frame_sigma_m")
         self._refuse_alone("control_ortho", "sigma_m")
-        geoid_or_datum = self.control_geoid or self.control_vertical
-        points = PointStatements(
-            stated_by_caller(
-                geoid_or_datum,
-                self.control_crs,
-                self.control_columns,
-                self.control_sigma_axes,
-                "--control-",
-            ),
-            sigma_pair(self.control_sigma_m, "--control-sigma-m"),
-            sigma_pair(self.control_frame_sigma_m, "--control-frame-sigma-m"),
-            self.control_mark_sigma_px,
-        )
         return ControlFiles(
             self.control,
-            points,
+            _point_statements(self),
             orthos=self.control_ortho,
             ortho_sigma_m=self.control_ortho_sigma_m,
             heights=self._heights(),
@@ -104,3 +139,19 @@ class ControlOptions:
         alone = [option_name(name) for name in names if getattr(self, name) is not None]
         if alone and not getattr(self, file):
             raise InputError(f"{', '.join(alone)}: of {option_name(file)}, which is missing; add it")
+
+
+def _point_statements(options: MarkOptions | ControlOptions) -> PointStatements:
+    """What options state of files of ground points."""
+    return PointStatements(
+        stated_by_caller(
+            options.control_geoid or options.control_vertical,
+            options.control_crs,
+            options.control_columns,
+            options.control_sigma_axes,
+            "--control-",
+        ),
+        sigma_pair(options.control_sigma_m, "--control-sigma-m"),
+        sigma_pair(options.control_frame_sigma_m, "--control-frame-sigma-m"),
+        options.control_mark_sigma_px,
+    )

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from amers.app.cli.control_options import MarkOptions
 from amers.app.cli.options import FromMilli, GeoidFile, words_of
 from amers.app.cli.output import AsJson
 from amers.app.cli.scene_registration import (
@@ -26,6 +27,7 @@ from amers.app.cli.scene_rows import (
 )
 from amers.app.errors import InputError
 from amers.app.usecases.model_choice import CropOrigin, ModelChoice
+from amers.app.usecases.registration.control_marks import MarkFiles
 from amers.app.usecases.registration.reference_source import ReferenceFiles, check_map
 from amers.app.usecases.registration.register import SceneFiles
 from amers.app.usecases.terrain_file import TerrainFile
@@ -54,8 +56,8 @@ class ControlOptions:
     reference_sigma_m: FromMilli = None
     reference_sigma_up_m: FromMilli = None
 
-    def files(self) -> Control:
-        """The block and the reference.
+    def files(self, marks: MarkFiles | None) -> Control:
+        """The block, the reference, and the marks of a person.
 
         Raises:
             InputError: something is stated of a reference that is not given, or it is not on a map.
@@ -68,10 +70,10 @@ class ControlOptions:
                 raise InputError(
                     "--reference-sigma-m, --reference-sigma-up-m: of a reference; add --reference"
                 )
-            return Control(self.block, None)
+            return Control(self.block, None, marks)
         check_map(self.reference)
         terrain = None if self.dem is None else TerrainFile(self.dem, self.vertical, self.geoid)
-        return Control(self.block, ReferenceFiles(self.reference, terrain, *sigmas_m))
+        return Control(self.block, ReferenceFiles(self.reference, terrain, *sigmas_m), marks)
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,7 @@ class WorkOptions:
     server: str | None = None
     token: Annotated[str | None, typer.Option(envvar="AMERS_TOKEN")] = None
 
-    def remote(self, control: ControlOptions) -> Remote | None:
+    def remote(self, control: ControlOptions, marks: MarkFiles | None) -> Remote | None:
         """The service; None without any.
 
         Raises:
@@ -154,6 +156,8 @@ class WorkOptions:
                 "--server: the service uses its own points and references; leave out --block and "
                 "--reference"
             )
+        if marks is not None:
+            raise InputError("--server: marks are files of this machine; leave out --control")
         if self.jobs > 1:
             raise InputError(
                 "--jobs: the workers of the service do the jobs; leave it out with --server"
@@ -171,6 +175,7 @@ def register(
     ],
     *,
     control: ControlOptions,
+    marks: MarkOptions,
     sigma_m: Annotated[
         float | None, typer.Option(help="Accuracy of the model, one sigma, metres.", min=0.01)
     ] = None,
@@ -185,15 +190,17 @@ def register(
     Each of several scenes gets a folder in the output folder, and a failed one does not stop the others.
     An older result in a folder is replaced as a whole; other files there are refused.
 
-    The points come from the store unless --block, --reference or --server is given.
+    The points come from the store unless --block, --reference, --control or --server is given. With
+    --control alone, the scene is registered on what a person marked in it: one mark gives a shift.
     """
     images = images_of(scenes)
     is_one_scene = len(scenes) == len(images) == 1 and not scenes[0].is_dir()
-    remote = work.remote(control)
+    mark_files = marks.files()
+    remote = work.remote(control, mark_files)
     refuse_shared_files(images, options.files_of_one)
-    control_files = control.files()
+    control_files = control.files(mark_files)
     models_of = models.of(images)
-    repeated = [*words_of(models), *words_of(options), *words_of(control)]
+    repeated = [*words_of(models), *words_of(options), *words_of(control), *words_of(marks)]
     repeated += [] if work.server is None else ["--server", work.server]
     requests = []
     for image in images:

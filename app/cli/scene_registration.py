@@ -24,6 +24,7 @@ from amers.app.db.engine import Database
 from amers.app.errors import AmersError, ComputationError, InputError
 from amers.app.usecases import storage_identity
 from amers.app.usecases.references import references_of_store
+from amers.app.usecases.registration.control_marks import MarkFiles
 from amers.app.usecases.registration.control_sources import points_of_block, points_of_store
 from amers.app.usecases.registration.failure import Attempt, has_report, write_failure
 from amers.app.usecases.registration.reference_source import ReferenceFiles, given_reference
@@ -63,10 +64,12 @@ class Control:
     Attributes:
         block: folder of a block.
         reference: ortho-image and its terrain.
+        marks: of a person in the scene.
     """
 
     block: Path | None
     reference: ReferenceFiles | None
+    marks: MarkFiles | None = None
 
 
 @dataclass(frozen=True)
@@ -250,6 +253,7 @@ def registered_outcome(request: SceneRequest, report: dict[str, Any]) -> Outcome
         "shift_m": correction["shift_m"],
         "residual_rms_px": report["image_residuals_px"]["xy"]["rms"],
         **_check_figures(report["checks"]),
+        **_of_marks(report.get("marks")),
         "output": request.folder,
         **_notes(report),
     }
@@ -291,10 +295,15 @@ def _check_figures(checks: list[dict[str, Any]]) -> dict[str, Any]:
     return {"check_points": accuracy["n"], "check_ce90_m": accuracy["ce90_m"]["value"]}
 
 
+def _of_marks(marks: dict[str, Any] | None) -> dict[str, Any]:
+    """What became of marks of a person, if there are any."""
+    return {} if marks is None else {"marks": marks}
+
+
 @contextmanager
 def registrar(control: Control) -> Iterator[Register]:
     """The function that registers scenes on the control of a command."""
-    if control.block is not None or control.reference is not None:
+    if control != Control(None, None):
         yield _on_files(control)
         return
     settings = read_settings()
@@ -307,6 +316,7 @@ def _on_files(control: Control) -> Register:
     sources = ControlSources(
         find_points=None if control.block is None else points_of_block(control.block),
         find_reference=None if control.reference is None else given_reference(control.reference),
+        marks=control.marks,
     )
 
     def register_one(request: SceneRequest, folder: Path, progress: Progress) -> dict[str, Any]:

@@ -56,6 +56,12 @@ def show_outcome(outcome: Outcome, *, as_json: bool) -> None:
         show_statements(outcome.get("statements", []))
         _show_findings([outcome])
         show_one(_verdict_rows(outcome) | _other_rows(outcome, tuple(outcome)), as_json=False)
+        if "marks" in outcome:
+            typer.echo()
+            show([_mark_row(mark) for mark in outcome["marks"]["marks"]], as_json=False)
+            typer.echo()
+            for sentence in outcome["marks"]["words"]:
+                typer.echo(printable(sentence))
 
 
 def show_outcomes(outcomes: list[Outcome], *, as_json: bool) -> None:
@@ -114,8 +120,25 @@ def _verdict_rows(outcome: Outcome) -> dict[str, Any]:
 
 def _other_rows(outcome: Outcome, names: tuple[str, ...]) -> dict[str, Any]:
     """The other figures of an outcome, for people."""
-    shown = {"scene", "verdict", "verdict_scope", "statements", "pixel_findings", *_STATED}
+    shown = {"scene", "verdict", "verdict_scope", "statements", "pixel_findings", "marks", *_STATED}
     return {name: _rounded(outcome.get(name)) for name in names if name not in shown}
+
+
+def _mark_row(mark: dict[str, Any]) -> dict[str, Any]:
+    """A mark in the table for people."""
+    return {
+        "mark": mark["name"],
+        "line": f"{mark['line']:.1f}",
+        "sample": f"{mark['sample']:.1f}",
+        "residual px": _pair(mark["residual_px"]),
+        "left out px": _pair(mark["left_out_px"]),
+        "its sigma px": _pair(mark["left_out_sigma_px"]),
+        "status": f"{mark['status']}{', ' if mark['note'] else ''}{mark['note']}",
+    }
+
+
+def _pair(values: list[float | None]) -> str:
+    return ", ".join("-" if value is None else f"{value:.2f}" for value in values)
 
 
 def _rounded(value: Any) -> Any:

@@ -212,6 +212,13 @@ _DESCRIPTIONS = {
         "Points that were not found at their expected places are searched again in a wide window. "
         "Number of these points that agree on another displacement, more than chance explains.",
     ),
+    "marks_in_doubt": _Description(
+        "Marks in doubt",
+        "",
+        0,
+        "Number of marks that disagree beyond their sigmas (chi-squared test, corrected for the number "
+        "of marks, p < 0.001) while nothing shows which of them are wrong.",
+    ),
     "check_points": _Description(
         "Normalised error at check points",
         "",

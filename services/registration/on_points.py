@@ -23,6 +23,7 @@ from amers.services.matching.control_points import ChipSearch, match_points
 from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.quality.frames import shared_frame
 from amers.services.quality.lack_of_fit import Elsewhere
+from amers.services.quality.marks import MarksReport
 from amers.services.quality.qualification import Qualification, qualify
 from amers.services.quality.stability import AdjustedScene
 from amers.services.registration.another_view import another_view
@@ -90,6 +91,7 @@ class Registration:
         search_stages: summaries of the searches, in order.
         frame: of the control on the Earth, see `shared_frame`.
         qualification: quality figures and verdict.
+        marks: what became of marks of a person; None without any.
     """
 
     model: SensorModel
@@ -99,6 +101,7 @@ class Registration:
     search_stages: tuple[SearchStage, ...]
     frame: Frame
     qualification: Qualification
+    marks: MarksReport | None = None
 
     def __repr__(self) -> str:
         counts, order = self.qualification.point_counts, self.adjustment.order

@@ -10,6 +10,7 @@ from amers.services.misfit.affine_fit import Order
 from amers.services.misfit.displacement_components import BENDS, Component
 from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.quality.criteria import VERDICT_EXPLANATIONS, verdict_scope
+from amers.services.quality.marks import MarksReport
 from amers.services.registration.on_points import Registration
 from amers.services.registration.options import RegistrationOptions
 from amers.services.reports.figure_data import FigureData
@@ -56,6 +57,8 @@ def build_report(
             f"affine: the nearest to the adjusted rigorous model, {nearest_px:.2g} px off it at most"
         )
         correction = replace(correction, order_reason=reason)
+    elif registration.marks is not None:
+        correction = replace(correction, order_reason=_reason_of_marks(registration.marks, correction))
     return RegistrationReport(
         format=REPORT_FORMAT,
         run=run,
@@ -78,6 +81,7 @@ def build_report(
         predicted=qualification.predicted,
         coverage=qualification.coverage,
         checks=checks,
+        marks=registration.marks,
         figure_data=figure_data,
     )
 
@@ -124,6 +128,15 @@ def _correction_record(
         words=correction_in_words(adjustment, gsd_m),
         sigma0=adjustment.sigma0,
         local_sigma_px=adjustment.local_sigma_px,
+    )
+
+
+def _reason_of_marks(marks: MarksReport, correction: CorrectionRecord) -> str:
+    """What of a correction the marks determine, as one sentence."""
+    used = sum(mark.status != "rejected" for mark in marks.marks)
+    determined = "all six parameters" if not marks.held else f"{6 - len(marks.held)} of six parameters"
+    return (
+        f"{correction.order}: {used} mark{'s' * (used != 1)} determine{'s' * (used == 1)} {determined}"
     )
 
 

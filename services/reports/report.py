@@ -15,6 +15,7 @@ from amers.services.quality.accuracy import Accuracy, NormalisedError
 from amers.services.quality.accuracy_statement import AccuracyStatement, StatedAccuracy
 from amers.services.quality.cell_stability import CellStability
 from amers.services.quality.criteria import Criterion, Verdict
+from amers.services.quality.marks import MarksReport
 from amers.services.quality.predicted import PredictedAccuracy
 from amers.services.quality.qualification import Coverage, GroundResiduals, PointCounts
 from amers.services.quality.stability import ImageResiduals, Stability
@@ -206,6 +207,7 @@ class RegistrationReport:
         predicted: accuracy by the covariance of the correction.
         coverage: of the image by active points.
         checks: accuracy at points that had no part in the registration.
+        marks: what became of marks of a person; null without any.
         figure_data: what the figures of the page draw; not part of report.json.
     """
 
@@ -230,6 +232,7 @@ class RegistrationReport:
     predicted: PredictedAccuracy
     coverage: Coverage
     checks: tuple[Check, ...]
+    marks: MarksReport | None
     figure_data: FigureData = field(metadata=NOT_IN_JSON)
 
     @property

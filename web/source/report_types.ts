@@ -152,12 +152,46 @@ export interface ImageResiduals {
   xy: Statistics;
 }
 
+export interface MarkResult {
+  name: string;
+  line: number | null;
+  sample: number | null;
+  lon: number | null;
+  lat: number | null;
+  height_m: number | null;
+  sigma_px: number | null;
+  sigma_m: Numbers[];
+  residual_px: Numbers[];
+  left_out_px: Numbers[];
+  left_out_sigma_px: Numbers[];
+  status: "used" | "rejected" | "in doubt";
+  note: string;
+}
+
+export interface MarksReport {
+  marks: MarkResult[];
+  prior_shift_px: number | null;
+  prior_slope_px: number | null;
+  held: string[];
+  next_mark: NextMark;
+  words: string[];
+}
+
 export interface MatchingOptions {
   max_views: number;
   agreement_px: number | null;
   min_gradient_score: number | null;
   view_distance: ViewDistanceScales;
   correlation: CorrelationOptions;
+}
+
+export interface NextMark {
+  line: number | null;
+  sample: number | null;
+  lon: number | null;
+  lat: number | null;
+  ce90_px: number | null;
+  ce90_m: number | null;
 }
 
 export interface NormalisedError {
@@ -308,6 +342,7 @@ export interface Report {
   predicted: PredictedAccuracy;
   coverage: Coverage;
   checks: Check[];
+  marks: MarksReport | null;
 }
 
 export interface RunRecord {

@@ -64,6 +64,22 @@ def marks_of_scene(path: Path, heights: str | None, image: Path, scene: Scene) -
         for option, instead in _OPTIONS:
             reword(error, partial(re.sub, option, instead))
         raise
+    return marks_in_image(marks, path, image, scene)
+
+
+def marks_in_image(marks: MarkedPoints, path: Path, image: Path, scene: Scene) -> MarkedPoints:
+    """The marks of a file that are in one image, or name none.
+
+    Args:
+        marks: of the file, one at least.
+        path: of the file.
+        image: of the scene.
+        scene: of the image.
+
+    Raises:
+        InputError: there is none, a mark lies outside the image, or latitude and longitude are
+            exchanged.
+    """
     names = np.char.lower(marks.image)
     is_in_scene = np.isin(names, ["", image.name.lower(), image.stem.lower()])
     if not is_in_scene.any():

@@ -13,7 +13,8 @@ from amers.app.db.engine import Connection
 from amers.app.usecases import history
 from amers.app.usecases.references import record_places
 from amers.app.usecases.registration.check_points import read_check_points
-from amers.app.usecases.registration.control_sources import FindPoints
+from amers.app.usecases.registration.control_marks import MarkFiles, read_control_marks
+from amers.app.usecases.registration.control_sources import ControlSet, FindPoints
 from amers.app.usecases.registration.deliverables import write_outputs
 from amers.app.usecases.registration.failure import Attempt, has_report, write_failure
 from amers.app.usecases.registration.reference_source import (
@@ -32,12 +33,13 @@ from amers.services.geodesy import metres_per_degree
 from amers.services.imagery.scene import Scene, scene_footprint
 from amers.services.joint.results import RigorousScene
 from amers.services.quality.check_points import CheckPoints, check_model, with_check_points
+from amers.services.registration.on_marks import NoChips, SceneMarks, register_on_marks
 from amers.services.registration.on_points import Registration, register_scene
 from amers.services.registration.options import RegistrationOptions
 from amers.services.reports.build import build_report, scene_record
 from amers.services.reports.document import report_document
 from amers.services.reports.figure_data import figure_data
-from amers.services.reports.report import Check, RefinedModelRecord, RegistrationReport
+from amers.services.reports.report import BlockUsed, Check, RefinedModelRecord, RegistrationReport
 from amers.services.sensors.base import SensorModel
 from amers.services.sensors.parameter_sets import parameter_set_named
 from amers.services.types import Array, Progress, no_progress, part_of
@@ -91,10 +93,12 @@ class ControlSources:
     Attributes:
         find_points: finds control points; None for none.
         find_reference: finds a reference image where there are no control points; None for none.
+        marks: files of ground points that a person marked in the image; None for none.
     """
 
     find_points: FindPoints | None = None
     find_reference: FindReference | None = None
+    marks: MarkFiles | None = None
 
 
 @dataclass(frozen=True)
@@ -168,19 +172,25 @@ def _register_and_write(
     """Register one scene and write the outputs; what is done is noted in the attempt."""
     scene = attempt.scene = files.read()
     attempt.measure_pixels()
-    check_points = None
+    held_out: list[tuple[str, CheckPoints]] = []
+    marks = None
+    if sources.marks is not None:
+        of_scene = read_control_marks(sources.marks, files.image, scene)
+        marks = of_scene.control
+        attempt.statements.extend(marks.statements)
+        if of_scene.check is not None:
+            held_out.append((sources.marks.name, of_scene.check))
     if files.check_points is not None:
         check_points = read_check_points(files.check_points, files.check_heights, files.image, scene)
         attempt.statements.extend(check_points.statements)
+        held_out.append((files.check_points.name, check_points))
 
-    registration, reference = _register(scene, sources, attempt, part_of(progress, 0.0, 0.9))
+    registration, reference = _register(scene, sources, marks, attempt, part_of(progress, 0.0, 0.9))
 
     checks: tuple[Check, ...] = ()
-    if check_points is not None and files.check_points is not None:
-        registration, check = _check(
-            registration, check_points, attempt.options, files.check_points.name
-        )
-        checks = (check,)
+    for name, points in held_out:
+        registration, check = _check(registration, points, attempt.options, name)
+        checks += (check,)
 
     progress(0.9, "writing the report")
     registered = write_registered(
@@ -290,9 +300,17 @@ def image_key(image: Path) -> str:
 
 
 def _register(
-    scene: Scene, sources: ControlSources, attempt: Attempt, progress: Progress
+    scene: Scene,
+    sources: ControlSources,
+    marks: SceneMarks | None,
+    attempt: Attempt,
+    progress: Progress,
 ) -> tuple[Registration, CoveringReference | None]:
     """The registration of a scene on control points, or else on a reference image, which is returned."""
+    if marks is not None and sources.marks is not None:
+        used = BlockUsed(sources.marks.name, "marks")
+        attempt.control = ControlSet(marks.points, NoChips(), (used,))
+        return register_on_marks(scene, marks, attempt.options), None
     outline = grown(scene_footprint(scene), MAX_ERROR_SIGMAS * scene.sigma_m)
     no_control = CoverageError("no reference image shows the ground of the scene")
     if sources.find_points is not None:

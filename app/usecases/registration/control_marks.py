@@ -1,0 +1,163 @@
+"""Read the marks that a scene is registered on: ground points that a person marked in its image."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from amers.app.errors import InputError
+from amers.app.usecases.marked_files import PointStatements
+from amers.app.usecases.registration.check_points import ground_positions, marks_in_image
+from amers.services.datums import filled_sigmas
+from amers.services.errors import refuse_unstated
+from amers.services.formats.gcp.marked_points import MarkedPoints
+from amers.services.formats.gcp.reader import read_marked_ground, read_or_missing
+from amers.services.imagery.scene import Scene, scene_gsd_m
+from amers.services.quality.check_points import MARKING_SIGMA_PX, CheckPoints
+from amers.services.registration.on_marks import SceneMarks
+from amers.services.statements import Statement, Statements, Subject, Use, gathered
+from amers.services.types import Frame
+
+
+@dataclass(frozen=True)
+class MarkFiles:
+    """Files of marks, and what they do not state.
+
+    Attributes:
+        paths: of the files, one at least.
+        points: heights, sigmas and frame, where the files state none.
+    """
+
+    paths: tuple[Path, ...]
+    points: PointStatements = field(default_factory=PointStatements)
+
+    @property
+    def name(self) -> str:
+        """Of the files, for people."""
+        return ", ".join(path.name for path in self.paths)
+
+
+@dataclass(frozen=True)
+class MarksOfScene:
+    """The marks of a scene.
+
+    Attributes:
+        control: those that the scene is registered on.
+        check: those that their files hold out; None without any.
+    """
+
+    control: SceneMarks
+    check: CheckPoints | None
+
+
+def read_control_marks(files: MarkFiles, image: Path, scene: Scene) -> MarksOfScene:
+    """The marks of a scene. A sigma that nobody states is assumed, and stated as such.
+
+    Args:
+        files: of the marks; marks in other images are not used.
+        image: of the scene.
+        scene: of the image; needs no heights if it is an ortho-image.
+
+    Raises:
+        InputError: a file cannot be used, does not state its heights, or has no mark of this scene; all
+            marks are check points; a point is marked twice.
+    """
+    read, unstated = [], []
+    for path in files.paths:
+        marks, missing = read_or_missing(read_marked_ground, path, files.points.stated)
+        unstated += missing
+        read.append((path, marks.take(marks.is_marked)))
+    refuse_unstated(unstated)
+    parts = [_completed(marks, path, files.points, image, scene) for path, marks in read]
+    several = len(parts) > 1
+    names = [
+        f"{path.name}:{name}" if several else name
+        for (path, _), part in zip(read, parts, strict=True)
+        for name in part.id.tolist()
+    ]
+    _refuse_twice(names, files)
+    lon_lat_h = np.concatenate(
+        [ground_positions(part, path, scene) for (path, _), part in zip(read, parts, strict=True)]
+    )
+    line_sample, sigma_m, sigma_px, check = (
+        np.concatenate([getattr(part, column) for part in parts])
+        for column in ("line_sample", "sigma_m", "sigma_px", "check")
+    )
+    if check.all():
+        raise InputError(
+            f"{files.name}: all {len(check)} marks are check points, none is left to register the scene "
+            "on; switch the flag of some off, or give the file as --check-points"
+        )
+    statements = gathered(chain(*(part.statements for part in parts)))
+    control, rows = np.flatnonzero(~check), np.flatnonzero(check)
+    frame_m = files.points.frame_sigma_m or (math.nan, math.nan)
+    return MarksOfScene(
+        SceneMarks(
+            names=tuple(names[row] for row in control),
+            lon_lat_h=lon_lat_h[control],
+            line_sample=line_sample[control],
+            sigma_m=sigma_m[control],
+            sigma_px=sigma_px[control],
+            frame=Frame.from_sigmas(*frame_m),
+            statements=statements,
+        ),
+        CheckPoints(lon_lat_h[rows], line_sample[rows], sigma_m[rows], sigma_px[rows])
+        if len(rows)
+        else None,
+    )
+
+
+def _completed(
+    marks: MarkedPoints, path: Path, points: PointStatements, image: Path, scene: Scene
+) -> MarkedPoints:
+    """The marks of a file in one image, with sigmas that the caller states, or that are assumed."""
+    if len(marks) == 0:
+        raise InputError(f"{path.name}: none of its marks is switched on; switch some on")
+    taken = marks_in_image(marks, path, image, scene)
+    statements: Statements = ()
+    sigma_m, sigma_px = taken.sigma_m, taken.sigma_px
+    if points.sigma_m is not None:
+        sigma_m = filled_sigmas(sigma_m, points.sigma_m, taken.datum_sigma_m)
+    elif np.isnan(sigma_m).any():
+        gsd_m = scene_gsd_m(scene)
+        sigma_m = filled_sigmas(sigma_m, (gsd_m, gsd_m), taken.datum_sigma_m)
+        statements += (
+            Statement(
+                path.name,
+                Subject.ACCURACY,
+                Use.ASSUMED,
+                f"{gsd_m:.2g} m, one pixel of the image",
+                "ground of the marks",
+                "state it with --control-sigma-m HORIZONTAL,UP",
+            ),
+        )
+    if np.isnan(sigma_px).any():
+        value_px = points.mark_sigma_px or MARKING_SIGMA_PX
+        sigma_px = np.nan_to_num(sigma_px, nan=value_px)
+        if points.mark_sigma_px is None:
+            statements += (
+                Statement(
+                    path.name,
+                    Subject.ACCURACY,
+                    Use.ASSUMED,
+                    f"{value_px:g} px",
+                    "positions of the marks in the image",
+                    "state it with --control-mark-sigma-px",
+                ),
+            )
+    return replace(
+        taken, sigma_m=sigma_m, sigma_px=sigma_px, statements=(*taken.statements, *statements)
+    )
+
+
+def _refuse_twice(names: Sequence[str], files: MarkFiles) -> None:
+    """Refuse a point that is marked twice in the image."""
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(
+            f"{files.name}: point {twice[0]} is marked {names.count(twice[0])} times in the image; "
+            "leave one mark of each point"
+        )

@@ -1,0 +1,206 @@
+"""SCENE AND MARKED GROUND IN -> REGISTERED MODEL OUT: what a person marked, without any search."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from amers.services.imagery.scene import Scene, scene_gsd_m
+from amers.services.misfit.control_observations import ControlObservations
+from amers.services.misfit.marked_scene import MarkedScene, MarkPriors, adjust_marks
+from amers.services.misfit.scene_adjustment import SceneAdjustment
+from amers.services.quality.criteria import at_most, verdict_of
+from amers.services.quality.marks import marks_report
+from amers.services.quality.qualification import Qualification, qualify
+from amers.services.quality.stability import AdjustedScene
+from amers.services.registration.on_points import Registration
+from amers.services.registration.options import RegistrationOptions
+from amers.services.sensors.correction import CorrectedModel
+from amers.services.statements import Statements
+from amers.services.types import (
+    Array,
+    BoolArray,
+    ChipArray,
+    ControlPoints,
+    Frame,
+    Measures,
+    ViewMeasures,
+    Views,
+)
+
+SLOPE = 1e-4
+"""A priori standard deviation of drift and skew, pixels per pixel: that of images of productions, and
+1 px at the edge of a scene of 20000 pixels, as in registrations on many points. In short images there is
+hardly any: a shift is enough for IKONOS up to 50 km (Grodecki and Dial, 2003, Block adjustment of
+high-resolution satellite images described by rational polynomials, PE&RS 69)."""
+_FEWEST_REPEATED = 3
+"""Marks from which parts of them are held out; with two, the one held out is nothing but the other."""
+_FEWEST_ON_SLOPES = 7
+"""Marks from which a correction that grows with the heights is told from chance: twice as many as
+parameters of a plane, and one more."""
+
+
+@dataclass(frozen=True)
+class SceneMarks:
+    """n points of known ground that a person marked in the image of a scene.
+
+    Attributes:
+        names: of the marks.
+        lon_lat_h: (n, 3).
+        line_sample: (n, 2).
+        sigma_m: (n, 3) of the ground: east, north, up.
+        sigma_px: (n,) of the picks, each coordinate.
+        frame: error on the Earth that all of them share.
+        statements: of their files.
+    """
+
+    names: tuple[str, ...]
+    lon_lat_h: Array
+    line_sample: Array
+    sigma_m: Array
+    sigma_px: Array
+    frame: Frame
+    statements: Statements = ()
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def covariance_m2(self) -> Array:
+        """(n, 3, 3) of the ground: east, north, up."""
+        return np.asarray(self.sigma_m[:, None, :] ** 2 * np.eye(3))
+
+    @property
+    def points(self) -> ControlPoints:
+        """The marks as control points without chips, numbered from 1."""
+        n, none = len(self), np.zeros(0)
+        no_rows = none.astype(np.int64)
+        zeros = np.zeros(n, dtype=np.int64)
+        return ControlPoints(
+            id=np.arange(1, n + 1),
+            lon_lat_h=self.lon_lat_h,
+            covariance_m2=self.covariance_m2,
+            block=zeros,
+            frames=(self.frame,),
+            saliency=np.ones(n),
+            health=np.ones(n),
+            views=Views(np.zeros(n + 1, dtype=np.int64), none, no_rows, none, none, none, ()),
+            chip_file=zeros,
+            chip_row=zeros,
+            chip_files=(),
+        )
+
+
+class NoChips:
+    """The chips of marks: there are none."""
+
+    def read(self, file: str, row: int, count: int) -> ChipArray:
+        """No chips (0, 101, 101)."""
+        return np.zeros((0, 101, 101), dtype=np.uint16)
+
+
+def register_on_marks(
+    scene: Scene, marks: SceneMarks, options: RegistrationOptions = RegistrationOptions()
+) -> Registration:
+    """Refine the model of a scene on known ground that a person marked in its image.
+
+    One mark is enough; see `adjust_marks`. The verdict has the limits of every registration, with three
+    differences: any number of marks may be usable, as each was named by a person; fewer than three are
+    not repeated without some of them; and pixels of the control are the accuracy of the ground.
+
+    Args:
+        scene: as delivered.
+        marks: one or more.
+        options: of the qualification, and the a priori standard deviation of drift and skew.
+
+    Raises:
+        CoverageError: no mark lies where the model of the scene is valid.
+    """
+    shape, gsd_m = scene.image.shape, scene_gsd_m(scene)
+    slope_px = min(options.adjustment.prior_slope_sigma_px, SLOPE * max(shape) / 2.0)
+    observations = ControlObservations(
+        marks.lon_lat_h, marks.line_sample, marks.sigma_px, marks.covariance_m2
+    )
+    marked = adjust_marks(scene.model, shape, observations, MarkPriors(scene.sigma_m / gsd_m, slope_px))
+
+    def refit(used: BoolArray) -> SceneAdjustment:
+        part = replace(observations, usable=used)
+        return adjust_marks(scene.model, shape, part, marked.priors, like=marked).adjustment
+
+    adjustment = marked.adjustment
+    model = CorrectedModel(scene.model, adjustment.correction)
+    adjusted = AdjustedScene(
+        model,
+        _measures(scene, marks, marked),
+        adjustment,
+        shape,
+        gsd_m,
+        marks.frame,
+        refit,
+        control_gsd_m=float(np.median(marks.sigma_m[:, :2])),
+    )
+    qualification = _qualified(adjusted, marked, options)
+    report = marks_report(adjusted, marked, marks.names, marks.sigma_m)
+    return Registration(
+        model,
+        adjustment,
+        adjusted.measures,
+        _NO_VIEWS,
+        (),
+        marks.frame,
+        qualification,
+        marks=report,
+    )
+
+
+_NO_VIEWS = ViewMeasures(
+    np.zeros(0, dtype=np.int64),
+    np.zeros(0, dtype=np.int64),
+    np.zeros(0),
+    np.zeros(0, dtype=np.bool_),
+    np.zeros(0, dtype=np.str_),
+)
+
+
+def _measures(scene: Scene, marks: SceneMarks, marked: MarkedScene) -> Measures:
+    """The marks as measures of points, without scores and views."""
+    n, adjustment = len(marks), marked.adjustment
+    model = CorrectedModel(scene.model, adjustment.correction)
+    derivative = model.project_derivative(marks.lon_lat_h)
+    seen = np.asarray(np.isfinite(adjustment.residual_px).all(axis=1))
+    residual_m = np.full((n, 2), np.nan)
+    residual_m[seen] = np.linalg.solve(
+        derivative[seen][:, :, :2], adjustment.residual_px[seen][:, :, None]
+    )[:, :, 0]
+    reason = np.where(adjustment.active, "", np.where(seen, "deactivated", "outside"))
+    return Measures(
+        point_id=np.arange(1, n + 1),
+        lon_lat_h=marks.lon_lat_h,
+        predicted=scene.model.project(marks.lon_lat_h),
+        line_sample=marks.line_sample,
+        sigma_px=marks.sigma_px,
+        score=np.full(n, np.nan),
+        views=np.zeros(n, dtype=np.int64),
+        by_gradient=np.zeros(n, dtype=bool),
+        residual_px=adjustment.residual_px,
+        residual_m=residual_m,
+        matched=seen,
+        active=adjustment.active,
+        reason=reason,
+    )
+
+
+def _qualified(scene: AdjustedScene, marked: MarkedScene, options: RegistrationOptions) -> Qualification:
+    """The quality figures of a registration on marks; see `register_on_marks`."""
+    limits = replace(options.qualification, usable_active_points=1)
+    qualification = qualify(scene, limits, np.random.default_rng(options.seed))
+    count = int(marked.adjustment.active.sum())
+    beyond_few = {
+        "displacement_px": count < _FEWEST_REPEATED,
+        "residual_std_px": count < _FEWEST_REPEATED,
+        "correction_against_height": count < _FEWEST_ON_SLOPES,
+    }
+    criteria = [one for one in qualification.criteria if not beyond_few.get(one.name, False)]
+    in_doubt = count if marked.disagree else 0
+    criteria.append(at_most("marks_in_doubt", in_doubt, 0, "usable"))
+    kept = tuple(criteria)
+    return replace(qualification, criteria=kept, verdict=verdict_of(kept))

@@ -1,0 +1,156 @@
+"""`amers scene register --control`: a scene registered on what a person marked in it, by command."""
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from amers.services.formats.images.raster import write_raster
+from amers.services.formats.sensor_models.rpc_files import read_rpc
+from tests.command_line import Done, amers_here
+from tests.services.simulated import ring_of_geometries
+
+GEOMETRY = ring_of_geometries(1, shape=(600, 800))[0]
+TRUE = GEOMETRY.rpc
+OFF_PX = np.array([24.0, -32.0])
+HEAD = "id,image,lon,lat,height_m,line,sample"
+SIGMAS = "sigma_horizontal_m,sigma_up_m,sigma_px"
+two_hundredths_of_a_pixel = 0.02
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    """An image whose RPC is 40 px off."""
+    path = tmp_path / "view.tif"
+    pixels = np.random.default_rng(0).integers(1, 255, GEOMETRY.plan.shape, dtype=np.uint8)
+    write_raster(path, pixels, replace(TRUE, image_offset=TRUE.image_offset - OFF_PX))
+    return path
+
+
+def write_marks(
+    path: Path, count: int = 6, head: str = f"{HEAD},{SIGMAS}", extra: str = ",0.1,0.1,0.3"
+) -> Path:
+    """Marks of exact ground, all over the image."""
+    picked = np.random.default_rng(1).uniform([60.0, 60.0], [540.0, 740.0], (count, 2))
+    ground = TRUE.locate(picked, np.linspace(80.0, 140.0, count))
+    rows = [
+        f"GCP{k},view.tif,{lon:.10f},{lat:.10f},{h:.4f},{line:.4f},{sample:.4f}{extra}"
+        for k, ((lon, lat, h), (line, sample)) in enumerate(zip(ground, picked, strict=True))
+    ]
+    path.write_text("\n".join(["# pixel-origin=centre heights=ellipsoid", head, *rows]) + "\n")
+    return path
+
+
+def register(image: Path, *words: object) -> Done:
+    command = ["scene", "register", image, *words, "-o", image.parent / "out"]
+    return amers_here(command, dict(os.environ))
+
+
+def report(image: Path) -> dict:
+    return json.loads((image.parent / "out" / "report.json").read_text())
+
+
+def test_the_refined_model_shows_the_ground_where_it_was_marked(image):
+    marks = write_marks(image.parent / "marks.csv")
+    ended = register(image, "--control", marks, "--control-frame-sigma-m", "0.05,0.05")
+    assert ended.returncode == 0, ended.stderr
+    refined = read_rpc(image, image.parent / "out" / "view_RPC.TXT").model
+    corners = np.array([[0.0, 0.0], [599.0, 799.0]])
+    ground = TRUE.locate(corners, np.full(2, 100.0))
+    assert refined.project(ground) == pytest.approx(corners, abs=two_hundredths_of_a_pixel)
+    assert "One more mark like these would lower the predicted CE90 from" in ended.stdout
+    assert "GCP5" in (image.parent / "out" / "control_points_pci.txt").read_text()
+    document = report(image)
+    assert [mark["name"] for mark in document["marks"]["marks"]] == [f"GCP{k}" for k in range(6)]
+    assert document["run"]["blocks"] == [{"id": "marks.csv", "version": "marks"}]
+    assert document["on_the_earth"]["ce90_m"] < 1.0
+    for page in ("report.html", "report.txt"):
+        assert "GCP5" in (image.parent / "out" / page).read_text()
+
+
+def test_a_blunder_is_named_in_every_place(image):
+    marks = write_marks(image.parent / "marks.csv")
+    rows = marks.read_text().splitlines()
+    cells = rows[4].split(",")
+    cells[5] = str(float(cells[5]) + 60.0)
+    marks.write_text("\n".join([*rows[:4], ",".join(cells), *rows[5:]]))
+    ended = register(image, "--control", marks)
+    assert ended.returncode == 0, ended.stderr
+    assert "Mark GCP2 is not used: it is 60.0 px off the other marks" in ended.stdout
+    assert "Mark GCP2 is not used" in (image.parent / "out" / "report.html").read_text()
+
+
+def test_sigmas_that_nobody_states_are_said_to_be_assumed(image):
+    marks = write_marks(image.parent / "marks.csv", head=HEAD, extra="")
+    ended = register(image, "--control", marks)
+    assert "ground of the marks: accuracy: " in ended.stderr
+    assert "one pixel of the image: assumed (state it with --control-sigma-m" in ended.stderr
+    assert "0.5 px: assumed (state it with --control-mark-sigma-px)" in ended.stderr
+    ended = register(image, "--control", marks, "--control-sigma-m", "0.2,0.3")
+    assert "ground of the marks" not in ended.stderr
+    sigma_m = [mark["sigma_m"] for mark in report(image)["marks"]["marks"]]
+    assert sigma_m == [[0.2, 0.2, 0.3]] * 6
+
+
+def test_check_points_of_the_file_are_held_out(image):
+    marks = write_marks(image.parent / "marks.csv", head=f"{HEAD},{SIGMAS},check")
+    rows = marks.read_text().splitlines()
+    flags = ["", "", *(f",{int(k >= 4)}" for k in range(6))]
+    marks.write_text("\n".join(row + flag for row, flag in zip(rows, flags, strict=True)))
+    ended = register(image, "--control", marks)
+    assert ended.returncode == 0, ended.stderr
+    document = report(image)
+    assert [mark["name"] for mark in document["marks"]["marks"]] == [f"GCP{k}" for k in range(4)]
+    assert document["checks"][0]["against"] == "independent check points of marks.csv"
+    assert document["checks"][0]["accuracy"]["n"] == 2
+    marks.write_text("\n".join([*rows[:2], *(row + ",1" for row in rows[2:])]))
+    ended = register(image, "--control", marks)
+    assert "marks.csv: all 6 marks are check points, none is left" in ended.stderr
+
+
+def test_one_mark_is_enough(image):
+    ended = register(image, "--control", write_marks(image.parent / "marks.csv", count=1))
+    assert ended.returncode == 0, ended.stderr
+    assert "A single mark is used, and nothing checks it" in ended.stdout
+
+
+def test_several_files_are_one_set_of_marks(image):
+    one = write_marks(image.parent / "one.csv", count=2)
+    two = write_marks(image.parent / "two.csv", count=3)
+    ended = register(image, "--control", one, "--control", two)
+    assert ended.returncode == 0, ended.stderr
+    names = [mark["name"] for mark in report(image)["marks"]["marks"]]
+    assert names == ["one.csv:GCP0", "one.csv:GCP1", "two.csv:GCP0", "two.csv:GCP1", "two.csv:GCP2"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--control-sigma-m", "3,5"], "--control-sigma-m: of --control, which is missing; add it"),
+        (["--control", "MARKS", "--server", "http://localhost"], "--server: marks are files of this"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(image, words, said):
+    marks = write_marks(image.parent / "marks.csv")
+    ended = register(image, *(marks if word == "MARKS" else word for word in words))
+    assert ended.returncode == 2
+    assert said in ended.stderr
+
+
+def test_marks_of_other_images_are_refused_by_their_names(image):
+    marks = write_marks(image.parent / "marks.csv")
+    marks.write_text(marks.read_text().replace("view.tif", "other.tif"))
+    ended = register(image, "--control", marks)
+    assert ended.returncode == 2
+    assert "marks.csv: expected marks in view.tif, found marks in other.tif" in ended.stderr
+
+
+def test_a_point_is_marked_once(image):
+    marks = write_marks(image.parent / "marks.csv")
+    rows = marks.read_text().splitlines()
+    marks.write_text("\n".join([*rows, rows[2]]))
+    ended = register(image, "--control", marks)
+    assert "point GCP0 is marked 2 times in the image; leave one mark of each point" in ended.stderr
