@@ -8,23 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from amers.services.adjustment.intersection import intersect
-from amers.services.formats.images.raster import open_raster
 from amers.services.formats.sensor_models.rpc_files import read_rpc
 from amers.services.formats.sensor_models.rpc_text import format_rpc_text
 from amers.services.geodesy import move_metres
-from amers.services.imagery.source import Window
 from amers.services.sensors.correction import ImageCorrection, fold_into_rpc, no_correction
-from amers.services.sensors.rpc import RpcModel
-from amers.services.types import Array, BoolArray, Observations
+from amers.services.types import Array
 from tests.command_line import Done, amers_here
-from tests.journeys.ties import independent_tracks
+from tests.journeys.ties import KnownGround
 
 pytestmark = [pytest.mark.real_data, pytest.mark.long]
 
-NAMES = ("img_01", "img_02", "img_03")
-VIEW = 1
-"""The view that is registered; the two others give the ground."""
 OFF_PX = np.array([24.0, -32.0])
 BLUNDER_PX = np.array([36.0, 48.0])
 SURVEY = (0.1, 0.3)
@@ -36,45 +29,18 @@ three_tenths_of_a_pixel = 0.3
 HEAD = "id,lon,lat,height_m,line,sample,sigma_horizontal_m,sigma_up_m,sigma_px"
 
 
-class Ties:
-    """Ground of details by two views, and where the third shows them."""
-
-    def __init__(self, folder: Path) -> None:
-        images = [folder / f"{name}.tif" for name in NAMES]
-        pixels = []
-        for image in images:
-            raster = open_raster(image)
-            pixels.append(raster.read(Window(0, 0, *raster.shape)))
-            raster.close()
-        models = [read_rpc(image).model for image in images]
-        tracks = independent_tracks(pixels)
-        others, own = self._of(tracks, tracks.image != VIEW), self._of(tracks, tracks.image == VIEW)
-        met = intersect(models, others, int(tracks.point[-1]) + 1).lon_lat_h[own.point]
-        misfit = own.line_sample - models[VIEW].project(met)
-        near = np.hypot(*(misfit - np.nanmedian(misfit, axis=0)).T) < 1.5
-        self.model, self.shape = models[VIEW], pixels[VIEW].shape
-        self.ground, self.shown = met[near], own.line_sample[near]
-
-    @staticmethod
-    def _of(tracks: Observations, rows: BoolArray) -> Observations:
-        return Observations(
-            tracks.point[rows], tracks.image[rows], tracks.line_sample[rows], tracks.sigma_px[rows]
-        )
-
-
 @pytest.fixture(scope="module")
-def ties(real_data: Path) -> Ties:
-    return Ties(real_data / "phr_calanques_triplet")
+def ties(real_data: Path) -> KnownGround:
+    return KnownGround.of_triplet(real_data)
 
 
 @pytest.fixture
-def image(real_data: Path, tmp_path: Path, ties: Ties) -> Path:
+def image(real_data: Path, tmp_path: Path, ties: KnownGround) -> Path:
     """The view with a model that is 40 px off."""
     path = tmp_path / "img_02.tif"
     shutil.copy(real_data / "phr_calanques_triplet" / path.name, path)
     frame = no_correction(ties.shape)
     off = ImageCorrection(np.column_stack([OFF_PX, np.zeros((2, 2))]), frame.centre, frame.half_size)
-    assert isinstance(ties.model, RpcModel)
     model = fold_into_rpc(ties.model, off)
     path.with_name("img_02_RPC.TXT").write_text(format_rpc_text(model))
     return path
@@ -82,7 +48,7 @@ def image(real_data: Path, tmp_path: Path, ties: Ties) -> Path:
 
 def marks(
     image: Path,
-    ties: Ties,
+    ties: KnownGround,
     count: int,
     sigmas: tuple[float, float],
     *,
@@ -106,7 +72,7 @@ def marks(
     return path
 
 
-def chosen(ties: Ties) -> Array:
+def chosen(ties: KnownGround) -> Array:
     """Rows of ties that become marks, at random places."""
     return np.random.default_rng(7).permutation(len(ties.ground))
 
@@ -116,7 +82,7 @@ def register(image: Path, file: Path) -> Done:
     return amers_here(command, dict(os.environ))
 
 
-def off_px(image: Path, ties: Ties) -> Array:
+def off_px(image: Path, ties: KnownGround) -> Array:
     """Mean distance (2,) of the ties that no mark is on from the refined model."""
     model = read_rpc(image, image.parent / "out" / "img_02_RPC.TXT").model
     rows = chosen(ties)[20 * DRAWS :]

@@ -1,15 +1,59 @@
 """Tie points independent of production and registration: features of larger scale than theirs."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
+from typing import Self
 
 import cv2
 import numpy as np
 
+from amers.services.adjustment.intersection import intersect
+from amers.services.formats.images.raster import open_raster
+from amers.services.formats.sensor_models.rpc_files import read_rpc
+from amers.services.imagery.source import Window
 from amers.services.matching.ground_features import FeatureOptions
+from amers.services.sensors.rpc import RpcModel
 from amers.services.types import Array, FloatImage, Observations
 
 LARGEST_PX = 12.0
+MATCHED_PX = 1.5
+"""Details farther than this from the median misfit of all are matched wrongly."""
+
+
+@dataclass(frozen=True)
+class KnownGround:
+    """Ground of n details by two views, and where a third shows them.
+
+    Attributes:
+        model, shape: of the third view, as delivered.
+        ground: (n, 3).
+        shown: (n, 2).
+    """
+
+    model: RpcModel
+    shape: tuple[int, int]
+    ground: Array
+    shown: Array
+
+    @classmethod
+    def of_triplet(cls, real_data: Path, view: int = 1) -> Self:
+        """The details of the triplet of Calanques, for one of its views."""
+        images = [real_data / "phr_calanques_triplet" / f"img_0{k}.tif" for k in (1, 2, 3)]
+        pixels = []
+        for image in images:
+            raster = open_raster(image)
+            pixels.append(raster.read(Window(0, 0, *raster.shape)))
+            raster.close()
+        models = [read_rpc(image).model for image in images]
+        tracks = independent_tracks(pixels)
+        own = tracks.take(np.flatnonzero(tracks.image == view))
+        others = tracks.take(np.flatnonzero(tracks.image != view))
+        met = intersect(models, others, int(tracks.point[-1]) + 1).lon_lat_h[own.point]
+        misfit = own.line_sample - models[view].project(met)
+        near = np.hypot(*(misfit - np.nanmedian(misfit, axis=0)).T) < MATCHED_PX
+        return cls(models[view], pixels[view].shape, met[near], own.line_sample[near])
 
 
 def independent_tracks(images: Sequence[FloatImage]) -> Observations:
