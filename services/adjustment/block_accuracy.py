@@ -81,28 +81,55 @@ def block_accuracy(system: ReducedSystem, pairs: Pairs, gauge: Gauge, of_images:
         followed = -np.linalg.solve(own, system.times(move)[of_images:])
         move[of_images:] = np.where(alone, gauge.move[of_images:], followed)
     weight = system.times(move)
-    frame_m2 = np.asarray(np.linalg.inv(move.T @ weight), dtype=np.float64)
+    frame_m2 = _frame_m2(move.T @ weight)
     # M + (a - 1) M D F D^T M has the inverse R + D F D^T / a: taking off a small F loses nothing.
     stiffer, root = _stiffened(weight, frame_m2)
-    relative = system.inverse(pairs, root) - _of_pairs(pairs, move, frame_m2 / stiffer)
+    relative = system.inverse(pairs, root) - _of_pairs(pairs, move, _felt(frame_m2) / stiffer)
     return BlockAccuracy(frame_m2, move, pairs, relative)
+
+
+def _frame_m2(weight: Array) -> Array:
+    """The inverse F of D^T M D; translations that change no parameter have the largest variance.
+
+    One image on one control point moves along its line of sight without any change.
+    """
+    values, vectors = np.linalg.eigh((weight + weight.T) / 2.0)
+    if values[0] > _UNFELT_M**-2.0:
+        return np.asarray(np.linalg.inv(weight), dtype=np.float64)
+    return np.asarray((vectors / np.maximum(values, _UNFELT_M**-2.0)) @ vectors.T)
+
+
+def _felt(frame_m2: Array) -> Array:
+    """The covariance of frames without the translations that change no parameter."""
+    values, vectors = np.linalg.eigh(frame_m2)
+    if values[-1] < _NEARLY * _UNFELT_M**2:
+        return frame_m2
+    return np.asarray((vectors * np.where(values < _NEARLY * _UNFELT_M**2, values, 0.0)) @ vectors.T)
 
 
 def joint_relative(system: ReducedSystem, accuracy: BlockAccuracy) -> Array:
     """Covariance (K, K) of all parameters for exact frames: `BlockAccuracy.relative` of all pairs."""
     stiffer, root = _stiffened(system.times(accuracy.move), accuracy.frame_m2)
-    added = accuracy.move @ (accuracy.frame_m2 / stiffer) @ accuracy.move.T
+    added = accuracy.move @ (_felt(accuracy.frame_m2) / stiffer) @ accuracy.move.T
     return np.asarray(system.dense_inverse(root) - added)
 
 
 def _stiffened(weight: Array, frame_m2: Array) -> tuple[float, Array]:
     """The factor a, and columns whose squares add (a - 1) M D F D^T M, of M D and F."""
-    stiffer = max(1.0, float(np.trace(frame_m2)) / len(frame_m2) / _LITTLE_M**2)
-    return stiffer, np.sqrt(stiffer - 1.0) * weight @ np.linalg.cholesky(frame_m2)
+    felt = _felt(frame_m2)
+    stiffer = max(1.0, float(np.trace(felt)) / len(felt) / _LITTLE_M**2)
+    if felt is frame_m2:
+        return stiffer, np.sqrt(stiffer - 1.0) * weight @ np.linalg.cholesky(felt)
+    values, vectors = np.linalg.eigh(felt)
+    return stiffer, np.sqrt(stiffer - 1.0) * weight @ (vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 _LITTLE_M = 0.1
 """Standard deviation of a frame that is taken off without loss."""
+_UNFELT_M = 1e5
+"""Standard deviation of a translation that changes no parameter: farther than any model is off, and its
+square still far from what rounding leaves of the others."""
+_NEARLY = 0.999
 
 
 def earth_frames(

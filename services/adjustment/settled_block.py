@@ -134,7 +134,11 @@ def _slope_factor(values: Array, priors: BlockPriors, determined: Array, so_far:
         return 1.0
     stated = priors.shape[slopes] * so_far**2
     found = float((values[slopes] ** 2 * stated).sum())
-    freedom = _SLOPE_OBSERVATIONS + float(determined[slopes].sum())
+    shown = float(determined[slopes].sum())
+    freedom = _SLOPE_OBSERVATIONS + shown
     # Few slopes tell their variance badly: regions of Student's law, relative to the normal law's.
-    few = freedom * (0.1 ** (-2.0 / freedom) - 1.0) / (2.0 * np.log(10.0))
-    return float(np.sqrt((_SLOPE_OBSERVATIONS + found) / freedom * few) / so_far)
+    least = max(freedom, 1.0)
+    few = least * (0.1 ** (-2.0 / least) - 1.0) / (2.0 * np.log(10.0))
+    variance = (_SLOPE_OBSERVATIONS + found) / freedom * few
+    # What is stated holds as far as not even one is shown: by one image on one control point, none.
+    return float(np.sqrt(1.0 + min(shown, 1.0) * (variance - 1.0)) / so_far)

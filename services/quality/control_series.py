@@ -25,8 +25,6 @@ FEWEST_CHECKED = 3
 """Check points that are left at least."""
 _ALL_SUBSETS = 3
 """Of up to so many images, all subsets are tried: more make single images, pairs, and all of them."""
-_FEWEST_OF_ONE = 2
-"""Control points of one image: with one of them, nothing shows whether it is right."""
 _FRAME = Frame.from_sigmas(1e-3, 1e-3)
 """Control and check points have the same frame, which no error of theirs shows: a millimetre."""
 
@@ -120,12 +118,7 @@ def control_series(
         )
     starts = rng.choice(usable, draws, replace=draws > len(usable))
     order = [_spread(points.known, usable, int(start), max(fits)) for start in starts]
-    configurations = [
-        (members, count)
-        for members in _subsets(len(points.images))
-        for count in fits
-        if count == 0 or len(members) > 1 or count >= _FEWEST_OF_ONE
-    ]
+    configurations = [(members, count) for members in _subsets(len(points.images)) for count in fits]
     rows = []
     for number, (members, count) in enumerate(configurations):
         message = f"{len(members)} images on {count} control points"

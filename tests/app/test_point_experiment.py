@@ -119,3 +119,10 @@ def test_the_command_prints_a_table_and_json(folder: Path) -> None:
     assert document["rows"][0]["rms_m"][2] is None
     refused = amers_here([*words, "--control-points", "few"], {})
     assert "--control-points: 'few' found, numbers expected" in refused.stderr
+
+
+def test_one_control_point_places_an_image_and_a_block(folder: Path) -> None:
+    result = run_experiment(files(folder), (POINT_M, POINT_M), (0, 1), TWICE)
+    assert [row.reason for row in result.rows] == [""] * len(result.rows)
+    rms = by(result.rows)
+    assert rms[1, 1][:2].mean() < 0.5 * rms[1, 0][:2].mean()
