@@ -127,7 +127,8 @@ class SurfaceHeights:
     Attributes:
         height_m: (n,) above the ellipsoid, in the frame of the point's block, of what stands at its
             longitude and latitude; NaN when unknown.
-        sigma_m: (n,) one standard deviation; NaN when unknown.
+        sigma_m: (n,) one standard deviation relative to the frame, with what neighbouring points share;
+            NaN when unknown.
     """
 
     height_m: Array

@@ -39,6 +39,8 @@ class BlockAdjustment:
         lon_lat_h: (p, 3) the points; NaN where they cannot be intersected.
         point_covariance_m2: (p, 3, 3) east, north, up, relative to the frame of the point's group: with
             the errors that points take over from images.
+        point_shared_m2: (p, 3, 3) these errors alone, which neighbouring points share: bends and tilts
+            of the whole block.
         group: (n,) group of images that points tie together; -1 for images without an observation.
         known: what a later block may be tied to: the images of the first group; None beyond 333 images.
         frames: of the groups, on the Earth. The error of a point on the Earth is that of its frame plus
@@ -58,6 +60,7 @@ class BlockAdjustment:
     slope_factor: float
     lon_lat_h: Array
     point_covariance_m2: Array
+    point_shared_m2: Array
     group: IntArray
     known: KnownImages | None
     frames: tuple[Frame, ...]
@@ -166,6 +169,7 @@ def _stated(problem: BlockProblem, last: Round, passes: Sequence[BoolArray]) -> 
         slope_factor=last.before.slope_factor,
         lon_lat_h=np.where(intersected[:, None], lon_lat_h, np.nan),
         point_covariance_m2=np.where(intersected[:, None, None], relative_m2, np.nan),
+        point_shared_m2=np.where(intersected[:, None, None], carried_m2, np.nan),
         group=group[: len(images)],
         known=_known(images, state.values, group, frames, of=(solved.system, accuracy)),
         frames=frames,

@@ -474,6 +474,9 @@ def _cut_out(
     surface = surfaces_at(
         scenes, places, options.surface_pairs, work=work, progress=part_of(progress, 0.0, 0.5)
     )
+    # A surface is made with the models of the block, and takes over what they are off by together.
+    of_models_m2 = adjustment.point_shared_m2[rows, 2, 2]
+    surface = replace(surface, sigma_m=np.sqrt(surface.sigma_m**2 + of_models_m2))
     cut = cut_points(
         scenes, places, chosen.shown, options.gsds_m, work=work, progress=part_of(progress, 0.5, 0.5)
     )

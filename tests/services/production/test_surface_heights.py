@@ -20,8 +20,8 @@ from amers.services.matching.ground_features import FeatureOptions
 from amers.services.production.image_production import Production, ProductionOptions, produce_points
 from amers.services.production.point_surfaces import surfaces_at
 from amers.services.production.tie_points import find_tie_points
-from amers.services.simulation.view import SimulatedView, simulate_block
-from amers.services.simulation.world import World
+from amers.services.simulation.view import SimulatedView, ViewPlan, simulate_block, simulate_view
+from amers.services.simulation.world import World, make_world
 from amers.services.tasks import Work
 from amers.services.types import Array, Observations, no_progress
 from tests.services.simulated import (
@@ -38,6 +38,8 @@ pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 honest = (0.7, 1.5)
 """Mean square of errors over their sigmas."""
+cautious = 0.3
+"""The same where sigmas are those of real images, and simulated ones are less noisy."""
 five_sigma = 5.0
 interval90 = 1.6449
 chips_m = (0.5, 2.0)
@@ -123,6 +125,49 @@ def test_simulated_surfaces_are_true_and_so_are_their_sigmas() -> None:
         assert np.mean((found.true_m / found.sigma_up_m) ** 2) > 2.0 * honest[1]
         assert held > 0.85
         assert np.abs(error_m / found.sigma_m).max() < five_sigma
+
+
+@pytest.mark.endurance
+@pytest.mark.monte_carlo
+def test_surfaces_of_bent_blocks_are_as_far_from_the_truth_as_stated() -> None:
+    """Images of 2.5 m with drifts of 0.6 px at the edges and jitter; without the block's translation."""
+    squares = []
+    for seed in range(1, 5):
+        ground, views = bent_pair(seed)
+        options = ProductionOptions(fine_gsd_m=2.5, coarse_gsd_m=10.0, points=150)
+        made = produce_points([view.as_scene(5.0) for view in views], options)
+        points, surface = made.points, made.points.surface
+        assert surface is not None
+        seen = np.stack([model.project(points.lon_lat_h) for model in made.adjustment.models], axis=1)
+        n = len(points)
+        rays = Observations(
+            np.repeat(np.arange(n), 2), np.tile([0, 1], n), seen.reshape(-1, 2), np.full(2 * n, 0.1)
+        )
+        true = intersect([view.geometry.true_model for view in views], rays, n).lon_lat_h
+        shift = (points.lon_lat_h - true).mean(axis=0)
+        error_m = surface.height_m - ground.surface_m((points.lon_lat_h - shift)[:, :2]) - shift[2]
+        known = np.isfinite(error_m)
+        assert known.sum() > 60
+        squares.append(float(np.mean((error_m[known] / surface.sigma_m[known]) ** 2)))
+        print(f"block {seed}: mean square {squares[-1]:.2f}")
+    print(f"all: {np.mean(squares):.2f}")
+    assert cautious < np.mean(squares) < honest[1]
+
+
+def bent_pair(seed: int) -> tuple[World, list[SimulatedView]]:
+    """Two images of 2.2 km from two sides, each with drifts and jitter of its own."""
+    rng = np.random.default_rng(seed)
+    ground = make_world(np.random.default_rng(seed + 100), size_m=3000.0, posting_m=2.0)
+    lon, lat = (float(value) for value in ground.centre_lon_lat)
+    turn_deg, views = rng.uniform(0.0, 360.0), []
+    for k in range(2):
+        incidence_deg = float(25.0 * rng.uniform(0.3, 1.0))
+        azimuth_deg = float((turn_deg + 180.0 * (k + rng.uniform(-0.2, 0.2))) % 360.0)
+        side = (900, 900)
+        plan = ViewPlan(f"view_{k}", (lon, lat), side, 2.5, incidence_deg, azimuth_deg, jitter_px=0.2)
+        drift_px = np.column_stack([np.zeros(2), rng.normal(0.0, 0.6, (2, 2))])
+        views.append(simulate_view(ground, plan, rng, (2.0, -2.0), drift_px))
+    return ground, views
 
 
 def test_no_surface_is_stated_without_a_pair_or_where_none_is_asked_for() -> None:
