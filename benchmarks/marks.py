@@ -22,7 +22,8 @@ from rasterio.transform import GCPTransformer
 from amers.services.geodesy import move_metres
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage
-from amers.services.registration.on_marks import SceneMarks, register_on_marks
+from amers.services.registration.on_marks import register_on_marks
+from amers.services.registration.scene_marks import SceneMarks
 from amers.services.sensors.correction import ImageCorrection, fold_into_rpc, no_correction
 from amers.services.sensors.rpc import RpcModel
 from amers.services.types import UNKNOWN_FRAME, Acquisition, Array

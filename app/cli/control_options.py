@@ -41,14 +41,17 @@ class MarkOptions:
     control_columns: str | None = None
     control_sigma_axes: str | None = None
 
-    def files(self) -> MarkFiles | None:
+    def files(self, of_many: bool = False) -> MarkFiles | None:
         """The files of the marks, with what the options state about them; None without any.
+
+        Args:
+            of_many: see `MarkFiles`.
 
         Raises:
             InputError: a value is wrong, or states something of a file that is not given.
         """
         if self.control:
-            return MarkFiles(self.control, _point_statements(self))
+            return MarkFiles(self.control, _point_statements(self), of_many)
         alone = [
             option_name(field.name)
             for field in fields(self)

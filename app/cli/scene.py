@@ -195,7 +195,7 @@ def register(
     """
     images = images_of(scenes)
     is_one_scene = len(scenes) == len(images) == 1 and not scenes[0].is_dir()
-    mark_files = marks.files()
+    mark_files = marks.files(of_many=len(images) > 1)
     remote = work.remote(control, mark_files)
     refuse_shared_files(images, options.files_of_one)
     control_files = control.files(mark_files)

@@ -6,11 +6,11 @@ from typing import Literal
 
 import numpy as np
 
-from amers.services.misfit.marked_scene import MarkedScene
+from amers.services.misfit.marked_scene import MarkedScene, MarkPriors
 from amers.services.quality.normal_law import normal_ce90
 from amers.services.quality.predicted import predict_accuracy
 from amers.services.quality.stability import AdjustedScene
-from amers.services.types import Array
+from amers.services.types import Array, IntArray
 
 MarkStatus = Literal["used", "rejected", "in doubt"]
 
@@ -29,6 +29,7 @@ class MarkResult:
     """What became of one mark.
 
     Attributes:
+        point: its number among the control points: -1, -2 and so on.
         name: of the mark.
         line, sample: where the image shows it, pixels.
         lon, lat, height_m: its ground, above the ellipsoid.
@@ -41,6 +42,7 @@ class MarkResult:
         note: in words, "" where there is nothing to say.
     """
 
+    point: int
     name: str
     line: float
     sample: float
@@ -81,7 +83,7 @@ class MarksReport:
     Attributes:
         marks: in the order of their files.
         prior_shift_px, prior_slope_px: a priori standard deviations of the shift, and of drift and skew
-            at the edge of the image, as the marks leave them.
+            at the edge of the image, as the marks leave them; the first is null beside other points.
         held: parameters that these determine, not the marks.
         next_mark: what one more mark would bring.
         words: all this in sentences.
@@ -111,6 +113,7 @@ def marks_report(
     used: MarkStatus = "in doubt" if marked.disagree else "used"
     marks = tuple(
         MarkResult(
+            point=int(measures.point_id[row]),
             name=name,
             line=float(measures.line_sample[row, 0]),
             sample=float(measures.line_sample[row, 1]),
@@ -128,7 +131,8 @@ def marks_report(
         for row, name in enumerate(names)
     )
     held = tuple(np.array(_PARAMETERS)[marked.held].tolist())
-    following = next_mark(scene, np.median(marked.noise_px2[measures.active], axis=0))
+    precise = measures.active if measures.active.any() else measures.matched
+    following = next_mark(scene, np.median(marked.noise_px2[precise], axis=0))
     return MarksReport(
         marks=marks,
         prior_shift_px=marked.priors.shift_px,
@@ -141,6 +145,52 @@ def marks_report(
             *(() if marked.disagree else (_next_words(scene, following),)),
         ),
     )
+
+
+def marks_beside_points(scene: AdjustedScene, names: Sequence[str], sigma_m: Array) -> MarksReport:
+    """What a registration on points says of n marks that are observations of the same adjustment.
+
+    Args:
+        scene: after its adjustment; the marks are its last measures.
+        names: of the marks.
+        sigma_m: (n, 3) of their ground.
+    """
+    n = len(names)
+    rows = np.arange(len(scene.measures.point_id) - n, len(scene.measures.point_id))
+    columns = {name: getattr(scene.measures, name)[rows] for name in vars(scene.measures)}
+    of_marks = replace(scene, measures=replace(scene.measures, **columns))
+    adjustment = scene.adjustment
+    measures = of_marks.measures
+    derivative = scene.model.project_derivative(measures.lon_lat_h)
+    ground_m2 = sigma_m[:, None, :] ** 2 * np.eye(3)
+    noise_px2 = derivative @ ground_m2 @ derivative.transpose(0, 2, 1)
+    noise_px2 = noise_px2 + measures.sigma_px[:, None, None] ** 2 * np.eye(2)
+    spread = adjustment.covariance_at(measures.line_sample) + noise_px2
+    marked = MarkedScene(
+        adjustment=replace(adjustment, active=measures.active, residual_px=measures.residual_px),
+        priors=MarkPriors(np.nan, adjustment.slope_px),
+        held=np.zeros((2, 3), dtype=np.bool_),
+        left_out_px=_without_each(scene, rows),
+        left_out_sigma_px=np.sqrt(np.diagonal(spread, 0, 1, 2)),
+        noise_px2=noise_px2,
+        alternative=np.full(n, -1, dtype=np.int64),
+        disagree=False,
+    )
+    return marks_report(of_marks, marked, names, sigma_m)
+
+
+def _without_each(scene: AdjustedScene, rows: IntArray) -> Array:
+    """Misfit (n, 2) of measures at some rows (n,) against the adjustment without each of them."""
+    left_out_px = scene.measures.residual_px[rows].copy()
+    for number, row in enumerate(rows.tolist()):
+        if not scene.measures.active[row] or scene.refit is None:
+            continue
+        used = scene.measures.active.copy()
+        used[row] = False
+        predicted = scene.measures.predicted[row][None]
+        shown = scene.measures.line_sample[row]
+        left_out_px[number] = shown - scene.refit(used).correction.apply(predicted)[0]
+    return left_out_px
 
 
 def next_mark(scene: AdjustedScene, noise_px2: Array) -> NextMark:
@@ -216,7 +266,7 @@ def _agreement_words(marked: MarkedScene, names: Sequence[str]) -> tuple[str, ..
         )
         for row in rejected
     ]
-    if active.sum() == 1:
+    if active.sum() == 1 and np.isfinite(marked.priors.shift_px):
         words.append("A single mark is used, and nothing checks it: mark a second point")
     return tuple(words)
 

@@ -1,6 +1,6 @@
 """SCENE AND MARKED GROUND IN -> REGISTERED MODEL OUT: what a person marked, without any search."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,18 +14,9 @@ from amers.services.quality.qualification import Qualification, qualify
 from amers.services.quality.stability import AdjustedScene
 from amers.services.registration.on_points import Registration
 from amers.services.registration.options import RegistrationOptions
+from amers.services.registration.scene_marks import SceneMarks
 from amers.services.sensors.correction import CorrectedModel
-from amers.services.statements import Statements
-from amers.services.types import (
-    Array,
-    BoolArray,
-    ChipArray,
-    ControlPoints,
-    Frame,
-    Measures,
-    ViewMeasures,
-    Views,
-)
+from amers.services.types import BoolArray, Measures, ViewMeasures
 
 SLOPE = 1e-4
 """A priori standard deviation of drift and skew, pixels per pixel: that of images of productions, and
@@ -37,65 +28,6 @@ _FEWEST_REPEATED = 3
 _FEWEST_ON_SLOPES = 7
 """Marks from which a correction that grows with the heights is told from chance: twice as many as
 parameters of a plane, and one more."""
-
-
-@dataclass(frozen=True)
-class SceneMarks:
-    """n points of known ground that a person marked in the image of a scene.
-
-    Attributes:
-        names: of the marks.
-        lon_lat_h: (n, 3).
-        line_sample: (n, 2).
-        sigma_m: (n, 3) of the ground: east, north, up.
-        sigma_px: (n,) of the picks, each coordinate.
-        frame: error on the Earth that all of them share.
-        statements: of their files.
-    """
-
-    names: tuple[str, ...]
-    lon_lat_h: Array
-    line_sample: Array
-    sigma_m: Array
-    sigma_px: Array
-    frame: Frame
-    statements: Statements = ()
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    @property
-    def covariance_m2(self) -> Array:
-        """(n, 3, 3) of the ground: east, north, up."""
-        return np.asarray(self.sigma_m[:, None, :] ** 2 * np.eye(3))
-
-    @property
-    def points(self) -> ControlPoints:
-        """The marks as control points without chips, numbered from 1."""
-        n, none = len(self), np.zeros(0)
-        no_rows = none.astype(np.int64)
-        zeros = np.zeros(n, dtype=np.int64)
-        return ControlPoints(
-            id=np.arange(1, n + 1),
-            lon_lat_h=self.lon_lat_h,
-            covariance_m2=self.covariance_m2,
-            block=zeros,
-            frames=(self.frame,),
-            saliency=np.ones(n),
-            health=np.ones(n),
-            views=Views(np.zeros(n + 1, dtype=np.int64), none, no_rows, none, none, none, ()),
-            chip_file=zeros,
-            chip_row=zeros,
-            chip_files=(),
-        )
-
-
-class NoChips:
-    """The chips of marks: there are none."""
-
-    def read(self, file: str, row: int, count: int) -> ChipArray:
-        """No chips (0, 101, 101)."""
-        return np.zeros((0, 101, 101), dtype=np.uint16)
 
 
 def register_on_marks(
@@ -173,7 +105,7 @@ def _measures(scene: Scene, marks: SceneMarks, marked: MarkedScene) -> Measures:
     )[:, :, 0]
     reason = np.where(adjustment.active, "", np.where(seen, "deactivated", "outside"))
     return Measures(
-        point_id=np.arange(1, n + 1),
+        point_id=marks.numbers,
         lon_lat_h=marks.lon_lat_h,
         predicted=scene.model.project(marks.lon_lat_h),
         line_sample=marks.line_sample,

@@ -23,7 +23,7 @@ from amers.services.matching.control_points import ChipSearch, match_points
 from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.quality.frames import shared_frame
 from amers.services.quality.lack_of_fit import Elsewhere
-from amers.services.quality.marks import MarksReport
+from amers.services.quality.marks import MarksReport, marks_beside_points
 from amers.services.quality.qualification import Qualification, qualify
 from amers.services.quality.stability import AdjustedScene
 from amers.services.registration.another_view import another_view
@@ -42,6 +42,7 @@ from amers.services.registration.options import RegistrationOptions
 from amers.services.registration.point_results import point_results
 from amers.services.registration.point_selection import initial_prediction, points_to_try, visible_points
 from amers.services.registration.rescaled import how_it_is_rescaled
+from amers.services.registration.scene_marks import SceneMarks, adjust_with_marks
 from amers.services.registration.search import (
     Search,
     adjust_search,
@@ -120,6 +121,7 @@ def register_scene(
     chips: ChipSource,
     options: RegistrationOptions = RegistrationOptions(),
     *,
+    marks: SceneMarks | None = None,
     progress: Progress = no_progress,
     stages: list[SearchStage] | None = None,
 ) -> Registration:
@@ -130,6 +132,7 @@ def register_scene(
         points: those of its footprint; points outside the scene are left aside.
         chips: of the points.
         options: of all stages.
+        marks: of a person in the scene: observations of the same adjustment.
         progress: receives the fraction done and the work under way.
         stages: receives the summaries of the searches, also of one that is refused.
 
@@ -156,7 +159,7 @@ def register_scene(
             raise
         raise TurnedImage(f"the image is {turned} ({error})") from error
     search, adjustment, elsewhere = adjust_with_places(context, search, adjustment)
-    return build_registration(context, context.points, search, adjustment, elsewhere)
+    return build_registration(context, context.points, search, adjustment, elsewhere, marks=marks)
 
 
 def _how_it_is_turned(
@@ -278,6 +281,8 @@ def build_registration(
     search: Search,
     adjustment: SceneAdjustment,
     elsewhere: Elsewhere | None = None,
+    *,
+    marks: SceneMarks | None = None,
 ) -> Registration:
     """The registration that the last search and its adjustment give, with its quality.
 
@@ -287,7 +292,12 @@ def build_registration(
         search: the last search of a part of them.
         adjustment: on this search.
         elsewhere: points that agree on another displacement; None when there are none.
+        marks: of a person in the scene, which are added to the adjustment; None without any.
     """
+    if marks is not None:
+        points, search, adjustment = adjust_with_marks(
+            context.scene, points, search, marks, context.options.adjustment
+        )
     context.progress(0.95, "qualifying the result")
     scene, options = context.scene, context.options
     measures = point_results(scene, points, search, adjustment)
@@ -323,4 +333,9 @@ def build_registration(
     view_measures = search.matches.view_measures
     views = replace(view_measures, point=search.rows[view_measures.point])
     context.progress(1.0, "registered")
-    return Registration(model, adjustment, measures, views, tuple(context.stages), frame, qualification)
+    report = None
+    if marks is not None:
+        report = marks_beside_points(adjusted, marks.names, marks.sigma_m)
+    return Registration(
+        model, adjustment, measures, views, tuple(context.stages), frame, qualification, report
+    )

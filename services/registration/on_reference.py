@@ -42,6 +42,7 @@ from amers.services.registration.options import RegistrationOptions
 from amers.services.registration.point_selection import initial_prediction
 from amers.services.registration.reference_points import ReferenceChips, reference_points
 from amers.services.registration.rescaled import how_it_is_rescaled
+from amers.services.registration.scene_marks import SceneMarks
 from amers.services.registration.search import (
     Search,
     adjust_search,
@@ -98,6 +99,7 @@ def register_on_reference(
     reference: Reference,
     options: RegistrationOptions = RegistrationOptions(),
     *,
+    marks: SceneMarks | None = None,
     progress: Progress = no_progress,
     earlier_places: Array | None = None,
     stages: list[SearchStage] | None = None,
@@ -113,6 +115,7 @@ def register_on_reference(
         scene: its model may be wrong by three times `scene.sigma_m`.
         reference: ortho-image and terrain.
         options: of all stages.
+        marks: of a person in the scene: observations of the same adjustment.
         progress: receives the fraction done and the work under way.
         earlier_places: (k, 3) ground positions that earlier scenes of the same ground were found by: at
             the finest level they are searched before any other place of their neighbourhood.
@@ -146,7 +149,7 @@ def register_on_reference(
         raise
     of_places = _with_chips(context, search)
     search, adjustment, elsewhere = adjust_with_places(of_places, search, adjustment)
-    return build_registration(context, search.points, search, adjustment, elsewhere)
+    return build_registration(context, search.points, search, adjustment, elsewhere, marks=marks)
 
 
 def _search_levels(

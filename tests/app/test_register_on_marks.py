@@ -154,3 +154,15 @@ def test_a_point_is_marked_once(image):
     marks.write_text("\n".join([*rows, rows[2]]))
     ended = register(image, "--control", marks)
     assert "point GCP0 is marked 2 times in the image; leave one mark of each point" in ended.stderr
+
+
+def test_marks_of_several_scenes_are_told_apart_by_their_names(image):
+    other = image.with_name("other.tif")
+    other.write_bytes(image.read_bytes())
+    marks = write_marks(image.parent / "other.csv")
+    marks.write_text(marks.read_text().replace(",view.tif,", ",,"))
+    command = ["scene", "register", image, other, "--control", marks, "-o", image.parent / "out"]
+    ended = amers_here(command, dict(os.environ))
+    assert "other.csv: expected marks in view.tif, found marks in other" in ended.stderr
+    document = json.loads((image.parent / "out" / "other" / "report.json").read_text())
+    assert document["verdict"] == "usable"

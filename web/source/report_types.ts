@@ -153,6 +153,7 @@ export interface ImageResiduals {
 }
 
 export interface MarkResult {
+  point: number;
   name: string;
   line: number | null;
   sample: number | null;

@@ -17,7 +17,7 @@ from amers.services.formats.gcp.marked_points import MarkedPoints
 from amers.services.formats.gcp.reader import read_marked_ground, read_or_missing
 from amers.services.imagery.scene import Scene, scene_gsd_m
 from amers.services.quality.check_points import MARKING_SIGMA_PX, CheckPoints
-from amers.services.registration.on_marks import SceneMarks
+from amers.services.registration.scene_marks import SceneMarks
 from amers.services.statements import Statement, Statements, Subject, Use, gathered
 from amers.services.types import Frame
 
@@ -29,10 +29,13 @@ class MarkFiles:
     Attributes:
         paths: of the files, one at least.
         points: heights, sigmas and frame, where the files state none.
+        of_many: whether they are of several scenes: marks that name no image are then in the one that
+            their file is named like.
     """
 
     paths: tuple[Path, ...]
     points: PointStatements = field(default_factory=PointStatements)
+    of_many: bool = False
 
     @property
     def name(self) -> str:
@@ -69,6 +72,8 @@ def read_control_marks(files: MarkFiles, image: Path, scene: Scene) -> MarksOfSc
     for path in files.paths:
         marks, missing = read_or_missing(read_marked_ground, path, files.points.stated)
         unstated += missing
+        if files.of_many:
+            marks = replace(marks, image=np.where(marks.image == "", path.stem, marks.image))
         read.append((path, marks.take(marks.is_marked)))
     refuse_unstated(unstated)
     parts = [_completed(marks, path, files.points, image, scene) for path, marks in read]

@@ -1,6 +1,6 @@
 """The outputs of a registration: write its report and control points, in the formats of many tools."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -56,7 +56,7 @@ def write_outputs(
     """
     measures = report.figure_data.measures
     sigma_m = _point_sigmas_m(points, measures)
-    names = [] if report.marks is None else [mark.name for mark in report.marks.marks]
+    names = {} if report.marks is None else {mark.point: mark.name for mark in report.marks.marks}
     marks = _marks(measures, sigma_m, points, image, model, names=names)
     files = write_report(folder, REGISTRATION_PAGE, report)
     geojson = format_measures(measures, image, sigma_m)
@@ -73,11 +73,11 @@ def _marks(
     image: str,
     model: SensorModel,
     *,
-    names: Sequence[str],
+    names: Mapping[int, str],
 ) -> MarkedPoints:
     """The matched points where the scene shows the surface at them, where it is known.
 
-    Marks of a person keep their names, which are those of the points 1, 2 and so on.
+    Marks of a person keep their names.
 
     The height at which chips are found is that of their whole content. Other tools take a mark for a
     place on the ground: it gets the height of the surface, and moves in the image by the parallax
@@ -95,7 +95,7 @@ def _marks(
         line_sample[known] += model.project(lon_lat_h[known]) - before
         sigma_m[known, 2] = points.surface.sigma_m[rows][known]
     return marked_points(
-        [names[point - 1] if names else str(point) for point in measures.point_id[matched].tolist()],
+        [names.get(point, str(point)) for point in measures.point_id[matched].tolist()],
         lon_lat_h,
         line_sample,
         sigma_m=sigma_m,

@@ -48,6 +48,7 @@ class Attempt:
         scene: once it was read.
         control: points around the scene, once they were looked for.
         reference: name of the reference image, once it was chosen; "" before.
+        marks: names of the files of marks; "" for none.
         stages: summaries of the searches, also of one that was refused.
         statements: of the files read, but for those of the scene.
         pixel_findings: what is wrong with the pixels of the scene, once they were measured.
@@ -60,6 +61,7 @@ class Attempt:
     scene: Scene | None = None
     control: ControlSet | None = None
     reference: str = ""
+    marks: str = ""
     stages: list[SearchStage] = field(default_factory=list)
     statements: list[Statement] = field(default_factory=list)
     pixel_findings: tuple[PixelFinding, ...] = ()
@@ -84,13 +86,17 @@ class Attempt:
     def run_record(self) -> RunRecord:
         """How and when the registration was run; it ends now."""
         blocks = () if self.control is None else self.control.blocks
+        if self.reference:
+            blocks = (BlockUsed(self.reference, "reference image"),)
+        if self.marks:
+            blocks = (*blocks, BlockUsed(self.marks, "marks"))
         of_scene = () if self.scene is None else self.scene.statements
         return RunRecord(
             software_version=version("amers"),
             started_at=self.started_at,
             finished_at=datetime.now(UTC),
             method="reference image" if self.reference else "control points",
-            blocks=(BlockUsed(self.reference, "reference image"),) if self.reference else blocks,
+            blocks=blocks,
             options=self.options,
             statements=gathered([*of_scene, *self.statements]),
         )

@@ -23,6 +23,7 @@ from amers.services.registration.on_points import Registration
 from amers.services.registration.on_reference import register_on_reference
 from amers.services.registration.options import RegistrationOptions
 from amers.services.registration.reference_points import ReferenceChips, reference_points
+from amers.services.registration.scene_marks import SceneMarks, with_marks
 from amers.services.reports.report import BlockUsed
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.types import Array, Frame, Progress
@@ -85,6 +86,7 @@ def register_on(
     scene: Scene,
     options: RegistrationOptions,
     *,
+    marks: SceneMarks | None = None,
     progress: Progress,
     stages: list[SearchStage] | None = None,
 ) -> tuple[Registration, ControlSet]:
@@ -95,6 +97,7 @@ def register_on(
         reference: opened from its files.
         scene: as delivered.
         options: of the registration.
+        marks: of a person in the scene: observations of the same adjustment.
         progress: receives the fraction done and a message.
         stages: receives the searches, also one that is refused.
 
@@ -105,12 +108,16 @@ def register_on(
         scene,
         reference,
         options,
+        marks=marks,
         progress=progress,
         earlier_places=covering.earlier_places,
         stages=stages,
     )
-    lon_lat_h = registration.measures.lon_lat_h
+    places = len(registration.measures.point_id) - (0 if marks is None else len(marks))
+    lon_lat_h = registration.measures.lon_lat_h[:places]
     points = reference_points(lon_lat_h, reference)
+    if marks is not None:
+        points = with_marks(points, marks)
     chips = ReferenceChips(reference, lon_lat_h)
     used = BlockUsed(covering.name, "reference image")
     return registration, ControlSet(points, chips, (used,))

@@ -33,13 +33,14 @@ from amers.services.geodesy import metres_per_degree
 from amers.services.imagery.scene import Scene, scene_footprint
 from amers.services.joint.results import RigorousScene
 from amers.services.quality.check_points import CheckPoints, check_model, with_check_points
-from amers.services.registration.on_marks import NoChips, SceneMarks, register_on_marks
+from amers.services.registration.on_marks import register_on_marks
 from amers.services.registration.on_points import Registration, register_scene
 from amers.services.registration.options import RegistrationOptions
+from amers.services.registration.scene_marks import NoChips, SceneMarks, with_marks
 from amers.services.reports.build import build_report, scene_record
 from amers.services.reports.document import report_document
 from amers.services.reports.figure_data import figure_data
-from amers.services.reports.report import BlockUsed, Check, RefinedModelRecord, RegistrationReport
+from amers.services.reports.report import Check, RefinedModelRecord, RegistrationReport
 from amers.services.sensors.base import SensorModel
 from amers.services.sensors.parameter_sets import parameter_set_named
 from amers.services.types import Array, Progress, no_progress, part_of
@@ -306,13 +307,14 @@ def _register(
     attempt: Attempt,
     progress: Progress,
 ) -> tuple[Registration, CoveringReference | None]:
-    """The registration of a scene on control points, or else on a reference image, which is returned."""
-    if marks is not None and sources.marks is not None:
-        used = BlockUsed(sources.marks.name, "marks")
-        attempt.control = ControlSet(marks.points, NoChips(), (used,))
-        return register_on_marks(scene, marks, attempt.options), None
+    """The registration of a scene on control points, or else on a reference image, which is returned.
+
+    Marks are observations of the same adjustment; without control points and a reference that show the
+    scene, it is registered on them alone.
+    """
     outline = grown(scene_footprint(scene), MAX_ERROR_SIGMAS * scene.sigma_m)
     no_control = CoverageError("no reference image shows the ground of the scene")
+    attempt.marks = "" if sources.marks is None else sources.marks.name
     if sources.find_points is not None:
         progress(0.0, "looking for points")
         control = attempt.control = sources.find_points(outline)
@@ -322,20 +324,32 @@ def _register(
                 control.points,
                 control.chips,
                 attempt.options,
+                marks=marks,
                 progress=progress,
                 stages=attempt.stages,
             )
+            if marks is not None:
+                attempt.control = replace(control, points=with_marks(control.points, marks))
             return registration, None
         except CoverageError as error:
             no_control = error
     reference = None if sources.find_reference is None else sources.find_reference(outline)
     if reference is None:
-        raise no_control
+        if marks is None:
+            raise no_control
+        attempt.control = ControlSet(marks.points, NoChips(), ())
+        return register_on_marks(scene, marks, attempt.options), None
     attempt.reference = reference.name
     opened = read_reference(reference.files)
     attempt.statements.extend(opened.statements)
     registration, attempt.control = register_on(
-        reference, opened, scene, attempt.options, progress=progress, stages=attempt.stages
+        reference,
+        opened,
+        scene,
+        attempt.options,
+        marks=marks,
+        progress=progress,
+        stages=attempt.stages,
     )
     return registration, reference
 

@@ -7,8 +7,9 @@ import pytest
 
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage
-from amers.services.registration.on_marks import SceneMarks, register_on_marks
+from amers.services.registration.on_marks import register_on_marks
 from amers.services.registration.on_points import Registration
+from amers.services.registration.scene_marks import SceneMarks
 from amers.services.types import UNKNOWN_FRAME, Array, Frame
 from tests.services.simulated import ring_of_geometries
 

@@ -1,0 +1,148 @@
+"""Ground points that a person marked in a scene: alone, or in addition to the points of a search."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from amers.services.imagery.scene import Scene
+from amers.services.misfit.scene_adjustment import AdjustmentOptions, SceneAdjustment
+from amers.services.registration.search import Search, adjust_search
+from amers.services.statements import Statements
+from amers.services.types import Array, ChipArray, ControlPoints, Frame, IntArray, SurfaceHeights, Views
+
+
+@dataclass(frozen=True)
+class SceneMarks:
+    """n points of known ground that a person marked in the image of a scene.
+
+    Attributes:
+        names: of the marks.
+        lon_lat_h: (n, 3).
+        line_sample: (n, 2).
+        sigma_m: (n, 3) of the ground: east, north, up.
+        sigma_px: (n,) of the picks, each coordinate.
+        frame: error on the Earth that all of them share.
+        statements: of their files.
+    """
+
+    names: tuple[str, ...]
+    lon_lat_h: Array
+    line_sample: Array
+    sigma_m: Array
+    sigma_px: Array
+    frame: Frame
+    statements: Statements = ()
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def covariance_m2(self) -> Array:
+        """(n, 3, 3) of the ground: east, north, up."""
+        return np.asarray(self.sigma_m[:, None, :] ** 2 * np.eye(3))
+
+    @property
+    def numbers(self) -> IntArray:
+        """Identities (n,) of the marks as control points: -1, -2 and so on, which no base has."""
+        return -np.arange(1, len(self) + 1)
+
+    @property
+    def points(self) -> ControlPoints:
+        """The marks as control points without chips."""
+        n, none = len(self), np.zeros(0)
+        no_rows = none.astype(np.int64)
+        zeros = np.zeros(n, dtype=np.int64)
+        return ControlPoints(
+            id=self.numbers,
+            lon_lat_h=self.lon_lat_h,
+            covariance_m2=self.covariance_m2,
+            block=zeros,
+            frames=(self.frame,),
+            saliency=np.ones(n),
+            health=np.ones(n),
+            views=Views(np.zeros(n + 1, dtype=np.int64), none, no_rows, none, none, none, ()),
+            chip_file=zeros,
+            chip_row=zeros,
+            chip_files=(),
+        )
+
+
+class NoChips:
+    """The chips of marks: there are none."""
+
+    def read(self, file: str, row: int, count: int) -> ChipArray:
+        """No chips (0, 101, 101)."""
+        return np.zeros((0, 101, 101), dtype=np.uint16)
+
+
+def with_marks(points: ControlPoints, marks: SceneMarks) -> ControlPoints:
+    """Control points, and behind them marks as points of a block of their own, without views."""
+    added = marks.points
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(points, name), getattr(added, name)])
+        for name in ("id", "lon_lat_h", "covariance_m2", "saliency", "health", "chip_file", "chip_row")
+    }
+    surface = points.surface
+    if surface is not None:
+        unknown = np.full(len(marks), np.nan)
+        surface = SurfaceHeights(
+            np.concatenate([surface.height_m, unknown]), np.concatenate([surface.sigma_m, unknown])
+        )
+    start = np.concatenate([points.views.start, np.full(len(marks), points.views.start[-1])])
+    return replace(
+        points,
+        **columns,
+        block=np.concatenate([points.block, np.full(len(marks), len(points.frames))]),
+        frames=(*points.frames, marks.frame),
+        views=replace(points.views, start=start),
+        surface=surface,
+    )
+
+
+def adjust_with_marks(
+    scene: Scene,
+    points: ControlPoints,
+    search: Search,
+    marks: SceneMarks,
+    options: AdjustmentOptions,
+) -> tuple[ControlPoints, Search, SceneAdjustment]:
+    """The points of a registration with marks behind them, the last search with these, its adjustment.
+
+    Args:
+        scene: as delivered.
+        points: all points that the scene may show.
+        search: the last one.
+        marks: in the scene.
+        options: of the adjustment.
+    """
+    n, matches = len(marks), search.matches
+    strips = matches.strips
+    if strips is not None:
+        unknown = np.full((n, *strips.displacement_px.shape[1:]), np.nan)
+        strips = replace(
+            strips,
+            line=np.concatenate([strips.line, np.zeros((n, strips.line.shape[1]))]),
+            displacement_px=np.concatenate([strips.displacement_px, unknown]),
+            sigma_px=np.concatenate([strips.sigma_px, unknown]),
+        )
+    matches = replace(
+        matches,
+        line_sample=np.concatenate([matches.line_sample, marks.line_sample]),
+        displacement_m=np.concatenate([matches.displacement_m, np.full((n, 2), np.nan)]),
+        sigma_px=np.concatenate([matches.sigma_px, marks.sigma_px]),
+        score=np.concatenate([matches.score, np.full(n, np.nan)]),
+        views=np.concatenate([matches.views, np.zeros(n, dtype=np.int64)]),
+        reason=np.concatenate([matches.reason, np.full(n, "")]),
+        by_gradient=np.concatenate([matches.by_gradient, np.zeros(n, dtype=np.bool_)]),
+        strips=strips,
+    )
+    search = replace(
+        search,
+        points=with_marks(search.points, marks),
+        rows=np.concatenate([search.rows, len(points) + np.arange(n)]),
+        matches=matches,
+        inliers=np.concatenate([search.inliers, np.ones(n, dtype=np.bool_)]),
+    )
+    adjustment = adjust_search(scene, search, options, ground_may_move=True)
+    return with_marks(points, marks), search, adjustment
