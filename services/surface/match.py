@@ -128,11 +128,9 @@ class SemiGlobal:
         sums = disparity_sums(costs, _in_contrasts(pair.second, pair.second_valid), penalties)
         second = best_disparities(sums, pair.lowest)
         del costs, sums
-        reason = self._reason(first, second, (pair.first, pair.first_valid), pair.lowest)
+        reason = self._reason(first, second, (pair.first, *valid), pair.lowest)
         # Seen from the second image, disparities have the other sign.
-        back = self._reason(
-            -second, -first, (pair.second, pair.second_valid), 1 - pair.lowest - pair.count
-        )
+        back = self._reason(-second, -first, (pair.second, *valid[::-1]), 1 - pair.lowest - pair.count)
         return Disparities(
             np.where(reason == Reason.FOUND, first, np.nan).astype(np.float32),
             np.where(back == Reason.FOUND, second, np.nan).astype(np.float32),
@@ -140,12 +138,18 @@ class SemiGlobal:
         )
 
     def _reason(
-        self, own: FloatImage, other: FloatImage, seen: tuple[FloatImage, BoolArray], lowest: int
+        self,
+        own: FloatImage,
+        other: FloatImage,
+        seen: tuple[FloatImage, BoolArray, BoolArray],
+        lowest: int,
     ) -> Reasons:
-        """Why pixels of an image have no disparity: by those of both directions, pixels, valid ones."""
-        pixels, valid = seen
+        """Why pixels have no disparity: by those of both directions, pixels, valid ones of both."""
+        pixels, valid, other_valid = seen
         reason = np.full(own.shape, Reason.FOUND, dtype=np.uint8)
         reason[~(differences(own, other) <= self.max_difference_px)] = Reason.HIDDEN
+        # Across gaps of the other image the penalties carry disparities that nothing shows.
+        reason[~seen_at(other_valid, own)] = Reason.HIDDEN
         reason[_flat(pixels, valid, self.least_contrast)] = Reason.NO_TEXTURE
         reason[~valid] = Reason.OUTSIDE
         found = np.where(reason == Reason.FOUND, own, np.nan).astype(np.float32)
@@ -155,6 +159,14 @@ class SemiGlobal:
     def bytes_per_disparity(self) -> int:
         """Costs of one byte, and sums of two."""
         return 3
+
+
+def seen_at(valid: BoolArray, disparity: FloatImage) -> BoolArray:
+    """Whether the pixels that lie at disparities (rows, columns) in the other image are valid there."""
+    rows, columns = np.indices(disparity.shape)
+    at = columns - np.rint(np.nan_to_num(disparity)).astype(np.int64)
+    inside = (at >= 0) & (at < valid.shape[1])
+    return np.asarray(inside & valid[rows, np.clip(at, 0, valid.shape[1] - 1)])
 
 
 _STEPS_PER_PX = 16

@@ -78,13 +78,14 @@ def match_pair(
     rectified = rectify(first.model, second.model, tile, heights_m, ratio)
     if rectified is None:
         return None
-    one, one_valid = resampled(first.image, rectified.first, rectified.shape)
-    two, two_valid = resampled(second.image, rectified.second, rectified.shape)
-    if not (one_valid.any() and two_valid.any()):
+    one, one_unseen = resampled(first.image, rectified.first, rectified.shape)
+    two, two_unseen = resampled(second.image, rectified.second, rectified.shape)
+    valid = one_unseen == Reason.FOUND, two_unseen == Reason.FOUND
+    if not (valid[0].any() and valid[1].any()):
         return None
-    pair = RectifiedPair(one, two, one_valid, two_valid, *rectified.disparities)
-    found = matcher.match(pair)
-    found.reason[_beside_second(found, two_valid)] = Reason.OUTSIDE
+    found = matcher.match(RectifiedPair(one, two, *valid, *rectified.disparities))
+    for unseen in (_unseen_by_second(found, two_unseen), one_unseen):
+        found.reason[unseen != Reason.FOUND] = unseen[unseen != Reason.FOUND]
     ground, centre, scale = _polynomials(rectified)
     disparities = rectified.nodes[:, 2].reshape(LEVELS, -1).mean(axis=1)
     levels_m = rectified.xy_h[:, 2].reshape(LEVELS, -1).mean(axis=1)
@@ -174,13 +175,13 @@ def _looked_at(  # noqa: PLR0917 - a place is three arrays
     return np.asarray(covered, dtype=np.bool_)
 
 
-def _beside_second(found: Disparities, second_valid: BoolArray) -> BoolArray:
-    """Pixels without a match that, were they as high as most, would lie beside the second image."""
+def _unseen_by_second(found: Disparities, unseen: Reasons) -> Reasons:
+    """Why the second image would not show pixels without a match, were they as high as most."""
     known = found.first[np.isfinite(found.first)]
     places = np.arange(found.first.shape[1]) - (round(float(np.median(known))) if len(known) else 0)
-    inside = (places >= 0) & (places < second_valid.shape[1])
-    seen = second_valid[:, np.clip(places, 0, second_valid.shape[1] - 1)] & inside
-    return np.asarray((found.reason == Reason.HIDDEN) & ~seen)
+    inside = (places >= 0) & (places < unseen.shape[1])
+    there = np.where(inside, unseen[:, np.clip(places, 0, unseen.shape[1] - 1)], Reason.OUTSIDE)
+    return np.where(found.reason == Reason.HIDDEN, there, Reason.FOUND).astype(np.uint8)
 
 
 def _polynomials(rectified: Rectification) -> tuple[Array, Array, Array]:

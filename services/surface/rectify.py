@@ -14,6 +14,7 @@ from amers.services.imagery.gaps import filled
 from amers.services.imagery.source import ImageSource, Window, low_pass
 from amers.services.map_grid import MapGrid
 from amers.services.sensors.base import SensorModel
+from amers.services.surface.match import Reason, Reasons
 from amers.services.types import Array, BoolArray, FloatImage
 
 _GROUND_NODES = 9
@@ -21,6 +22,8 @@ _GROUND_NODES = 9
 _FEWEST_NODES = 2 * _GROUND_NODES
 LEVELS = 3
 """Heights between the lowest and the highest one, at which the models are evaluated."""
+_WHOLE = 0.99
+"""Share of valid pixels under a rectified one from which it is valid; rounding leaves less than one."""
 _MARGIN_PX = 8
 """Pixels read beyond what is resampled, for the kernel and the low-pass."""
 
@@ -103,8 +106,8 @@ def rectify(
     )
 
 
-def resampled(image: ImageSource, affine: Array, shape: tuple[int, int]) -> tuple[FloatImage, BoolArray]:
-    """A rectified image, and which of its pixels are valid.
+def resampled(image: ImageSource, affine: Array, shape: tuple[int, int]) -> tuple[FloatImage, Reasons]:
+    """A rectified image, and why pixels show nothing; `Reason.FOUND` for those that do.
 
     Args:
         image: to be read where the rectified one needs it.
@@ -120,12 +123,18 @@ def resampled(image: ImageSource, affine: Array, shape: tuple[int, int]) -> tupl
     last = np.array(image.shape[::-1])
     high = np.minimum(np.ceil(samples_lines.max(axis=0) + margin), last).astype(int)
     if (high <= low).any():
-        return np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.bool_)
+        return np.zeros(shape, dtype=np.float32), np.full(shape, Reason.OUTSIDE, dtype=np.uint8)
     pixels = image.read(Window(int(low[1]), int(low[0]), *(int(n) for n in (high - low)[::-1])))
-    valid = np.isfinite(pixels)
     smooth = low_pass(filled(pixels), ratio) if ratio > 1.0 else filled(pixels)
     matrix = np.column_stack([affine[:, 1:], affine[:, 0] + affine[:, 1:] @ low])
     size = (shape[1], shape[0])
     warped = cv2.warpAffine(smooth, matrix, size, flags=cv2.INTER_CUBIC)
-    nearest = cv2.warpAffine(valid.astype(np.float32), matrix, size, flags=cv2.INTER_LINEAR)
-    return np.asarray(warped, dtype=np.float32), np.asarray(nearest > 0.99)
+
+    def share(where: BoolArray) -> FloatImage:
+        return np.asarray(cv2.warpAffine(where.astype(np.float32), matrix, size, flags=cv2.INTER_LINEAR))
+
+    unseen = np.where(share(np.isfinite(pixels)) > _WHOLE, Reason.FOUND, Reason.OUTSIDE).astype(np.uint8)
+    for reason, gap in ((Reason.NO_DATA, np.isnan(pixels)), (Reason.SATURATED, np.isposinf(pixels))):
+        if gap.any():
+            unseen[(unseen != Reason.FOUND) & (share(gap) > 1.0 - _WHOLE)] = reason
+    return np.asarray(warped, dtype=np.float32), unseen
