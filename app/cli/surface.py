@@ -19,7 +19,15 @@ from amers.app.usecases.surface_difference import write_surface_difference
 from amers.app.usecases.surface_points import write_surface_points
 from amers.services.surface.options import MOST_FILL_CELLS, SurfaceOptions
 
-Files = Annotated[SurfaceFiles, Shown(images=typer.Argument(exists=True), registered=None, block=None)]
+Files = Annotated[
+    SurfaceFiles,
+    Shown(
+        images=typer.Argument(exists=True),
+        registered=None,
+        block=None,
+        water=typer.Option(exists=True),
+    ),
+]
 
 
 @dataclass(frozen=True)

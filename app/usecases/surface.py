@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from amers.app.usecases.image_production import WorkPlace
 from amers.app.usecases.registered_scene import SceneModel, adjusted_model, read_registered_scene
 from amers.app.usecases.report_files import write_texts
 from amers.services.datums import horizontal
+from amers.services.formats.ground_masks import ExcludedGround, any_of, read_ground_mask
 from amers.services.formats.images.ortho import BandForm, write_cog
 from amers.services.formats.images.scenes import read_scene, scene_name
 from amers.services.formats.images.surfaces import BANDS, heights_crs, read_reduced
@@ -48,11 +50,13 @@ class SurfaceFiles:
         registered: folder with the registrations of the images, one folder each, as `amers scene
             register-many -o` writes it.
         block: folder of a block that was made from the images, whose adjusted models are used.
+        water: what empty cells say: polygons in GeoJSON, or an image on a map, not 0 there; repeat.
     """
 
     images: tuple[Path, ...]
     registered: Path | None = None
     block: Path | None = None
+    water: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -137,7 +141,8 @@ def run_surface(
     with ExitStack() as stack:
         scenes = [_scene(image, files, stack) for image in files.images]
         named = [scene_of_file(scene, image) for scene, image in zip(scenes, files.images, strict=True)]
-        return write_surface(named, output, options, place=place, progress=progress)
+        water = [read_ground_mask(path) for path in files.water]
+        return write_surface(named, output, options, water=water, place=place, progress=progress)
 
 
 def check_images(images: Sequence[Path], output: Path) -> None:
@@ -158,6 +163,7 @@ def write_surface(
     options: SurfaceOptions,
     *,
     grid: MapGrid | None = None,
+    water: Sequence[ExcludedGround] = (),
     place: WorkPlace,
     progress: Progress = no_progress,
 ) -> SurfaceFile:
@@ -167,6 +173,7 @@ def write_surface(
         scenes: two or more.
         output, options, place, progress: as `run_surface` takes them.
         grid: of the surface; see `make_surface`.
+        water: what empty cells there say.
 
     Raises:
         CoverageError: the scenes do not show the same ground, or nothing of it was matched.
@@ -180,7 +187,8 @@ def write_surface(
             opened, options, grid=grid, work=work, progress=part_of(progress, 0.0, 0.85)
         )
         counter = _Cells()
-        tiles = counter.count(surface_tiles(surface, part_of(progress, 0.85, 0.15)))
+        fused = surface_tiles(surface, part_of(progress, 0.85, 0.15), any_of([*water]))
+        tiles = counter.count(fused)
         crs = heights_crs(surface.grid)
         write_cog(
             output,
@@ -209,7 +217,7 @@ def write_surface(
         counter.by_label(lines * samples),
         counter.median_sigma_m,
         dict(work.effort),
-        gathered(one for scene in opened for one in scene.statements),
+        gathered(chain(*(one.statements for one in opened), *(one.statements for one in water))),
     )
     _write_report(written)
     return written

@@ -1,6 +1,6 @@
 """A surface from overlapping scenes: pairs of images chosen, matched tile by tile, aligned and fused."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -11,7 +11,7 @@ from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import Window
 from amers.services.map_grid import MapGrid
 from amers.services.surface.coarse import AGREES_CELLS, CoarseSearch
-from amers.services.surface.match import Reasons
+from amers.services.surface.match import Reason, Reasons
 from amers.services.surface.options import SurfaceOptions
 from amers.services.surface.pairs import BEST_BASE, LEAST_SHOWN, Pair, candidate_pairs, pairs_over
 from amers.services.surface.stages import Stages, fuse_task
@@ -24,7 +24,10 @@ from amers.services.surface.tiles import (
     windows_of,
 )
 from amers.services.tasks import Work
-from amers.services.types import Array, FloatImage, Progress, no_progress, part_of
+from amers.services.types import Array, BoolArray, FloatImage, Progress, no_progress, part_of
+
+Water = Callable[[Array], BoolArray]
+"""Which places (n, 2), longitude and latitude, are water."""
 
 _DEFAULT = SurfaceOptions()
 
@@ -137,12 +140,15 @@ def surface_grid(scenes: Sequence[Scene], options: SurfaceOptions = _DEFAULT) ->
     return grid_over(scenes, candidates, options.gsd_m)
 
 
-def surface_tiles(surface: Surface, progress: Progress = no_progress) -> Iterator[SurfaceTile]:
+def surface_tiles(
+    surface: Surface, progress: Progress = no_progress, water: Water | None = None
+) -> Iterator[SurfaceTile]:
     """The tiles of a surface, fused as many at once as the work is ahead.
 
     Args:
         surface: matched and aligned.
         progress: receives the fraction done.
+        water: the reason of empty cells there; None where no water is stated.
     """
     stages, ahead = surface.stages, surface.stages.work.ahead
     for first in range(0, len(surface.tiles), ahead):
@@ -153,9 +159,19 @@ def surface_tiles(surface: Surface, progress: Progress = no_progress) -> Iterato
         stages.work.run(fuse_task, tasks)
         for tile in group:
             found = stages.work.kept[f"fuse/{tile.name}"]
-            yield SurfaceTile(
+            made = SurfaceTile(
                 tile.window, found["height_m"], found["sigma_m"], found["views"], found["reason"]
             )
+            yield made if water is None else _with_water(made, surface.grid, water)
+
+
+def _with_water(tile: SurfaceTile, grid: MapGrid, water: Water) -> SurfaceTile:
+    """The same tile, whose empty cells say where they are water."""
+    empty = np.argwhere(tile.reason != Reason.FOUND)
+    reason = tile.reason.copy()
+    on_water = empty[water(grid.lon_lat(empty + [float(tile.window.line), float(tile.window.sample)]))]
+    reason[on_water[:, 0], on_water[:, 1]] = Reason.WATER
+    return replace(tile, reason=reason)
 
 
 def _heights_m(scenes: Sequence[Scene], options: SurfaceOptions) -> tuple[float, float]:

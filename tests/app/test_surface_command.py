@@ -25,6 +25,7 @@ from tests.factories import BOX, control_points, metadata, noise_chips
 from tests.factories import images as images_of
 from tests.services.surface.worlds import town
 
+EVERYWHERE = '{"type": "Polygon", "coordinates": [[[-9, -9], [9, -9], [9, 89], [-9, 89], [-9, -9]]]}'
 OPEN_GROUND = town().centre_lon_lat[None, :] + [[0.0, -0.0004]]
 
 
@@ -57,6 +58,14 @@ def test_the_file_has_heights_above_the_ellipsoid(images: tuple[Path, ...], tmp_
     terrain = read_dem(output)
     assert terrain.geoid is None
     assert terrain.height_m(OPEN_GROUND) == pytest.approx(town().height_m(OPEN_GROUND), abs=0.3)
+
+
+def test_empty_cells_on_stated_water_say_so(images: tuple[Path, ...], tmp_path: Path) -> None:
+    (tmp_path / "sea.geojson").write_text(EVERYWHERE)
+    command = ["surface", "make", *images, "-o", tmp_path / "surface.tif", "--gsd-m", 0.5, "--json"]
+    command += ["--heights-m", "140,180", "--water", tmp_path / "sea.geojson"]
+    done = amers_here(command, {"PATH": ""})
+    assert set(json.loads(done.stdout)["cells"]) == {"has a height", "stated as water"}
 
 
 def test_work_that_was_stopped_goes_on_to_the_same_bytes(

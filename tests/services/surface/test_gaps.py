@@ -1,4 +1,4 @@
-"""Where images are saturated or have no data, no height is made up, and why is said."""
+"""Where images are saturated, have no data, or show water, no height is made up, and why is said."""
 
 from dataclasses import replace
 
@@ -10,7 +10,8 @@ from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage, Window
 from amers.services.surface.match import Reason
 from amers.services.surface.options import SurfaceOptions
-from amers.services.types import Array
+from amers.services.surface.surface import make_surface, surface_tiles
+from amers.services.types import Array, BoolArray
 from tests.services.surface.worlds import Compared, compared_scenes, grid, scene, town
 
 UNFILLED = SurfaceOptions(fill_cells=0)
@@ -76,3 +77,21 @@ def test_other_views_tell_what_one_does_not_show() -> None:
 def test_what_no_view_shows_is_saturated() -> None:
     found = views(3, 0, 1, 2)
     assert (found.reason[inside()] == Reason.SATURATED).all()
+
+
+def test_empty_cells_on_stated_water_say_so_and_others_do_not() -> None:
+    west_lon = place()[0]
+
+    def water(lon_lat: Array) -> BoolArray:
+        return np.asarray(lon_lat[:, 0] < west_lon)
+
+    surface = make_surface([spoiled("left", np.inf), scene("right")], UNFILLED, grid=grid())
+    plain, stated = (
+        np.concatenate([tile.reason.ravel() for tile in surface_tiles(surface, water=mask)])
+        for mask in (None, water)
+    )
+    assert len(list(surface_tiles(surface))) == 1
+    cells = np.indices(grid().shape).reshape(2, -1).T.astype(np.float64)
+    wet = water(grid().lon_lat(cells)) & (plain != Reason.FOUND)
+    assert wet.any()
+    np.testing.assert_array_equal(stated, np.where(wet, Reason.WATER, plain))
