@@ -22,6 +22,7 @@ from amers.app.usecases.model_choice import ModelChoice
 from amers.app.usecases.new_block import BlockIdentity, refuse_existing
 from amers.services.formats.addresses import file_place
 from amers.services.production.image_production import Production, ProductionOptions
+from amers.services.reports.block_adjustment import without_surface_words
 from amers.services.reports.block_adjustment_pages import IMAGES_PAGE
 from amers.services.reports.text import print_text
 from amers.services.types import Progress, part_of
@@ -155,11 +156,13 @@ def run(
 def _row(production: Production, output: Path, *, as_json: bool) -> Row:
     """The figures of a production, by their names."""
     relative = production.relative_accuracy
+    words = without_surface_words(production.without_surface, len(production.points)) or "none"
     return {
         "block": output,
         "report": output.with_name(f"{output.name}.adjustment") / "report.html",
         "points": len(production.points),
         "views": int(production.points.views.start[-1]),
+        "points_without_surface": dict(production.without_surface) if as_json else words,
         "tie_points": relative.tie_points,
         "ray_residual_delivered_px": round(relative.before_px, 3),
         "ray_residual_adjusted_px": round(relative.after_px, 3),

@@ -123,6 +123,7 @@ class Production:
         image_fits: how every image fits.
         point_fits: how the points fit, in their order.
         effort: what every stage took; "adjustment" is all that is not done in tasks.
+        without_surface: number of points without a height of the surface, by the reason.
         statements: of the files, as far as the caller adds them.
     """
 
@@ -135,6 +136,7 @@ class Production:
     image_fits: tuple[ImageFit, ...]
     point_fits: PointFits
     effort: Mapping[str, Effort]
+    without_surface: Mapping[str, int]
     statements: Statements = ()
 
 
@@ -180,7 +182,7 @@ def produce_points(
     progress(0.8, "adjusting the block on its chips")
     measured, adjustment = images.adjusted_with_noise(measured)
     chosen = _chosen(images, measured, adjustment, excluded)
-    points, chips = _cut_out(images, adjustment, chosen, work, part_of(progress, 0.8, 0.2))
+    points, chips, missing = _cut_out(images, adjustment, chosen, work, part_of(progress, 0.8, 0.2))
     progress(1.0, f"{len(points)} points")
     return Production(
         points,
@@ -192,6 +194,7 @@ def produce_points(
         image_fits(scenes, measured.measures, adjustment),
         point_fits(chosen.rows, measured.measures, adjustment),
         {**work.effort, "adjustment": Effort(1, time.thread_time() - begun)},
+        missing,
     )
 
 
@@ -467,16 +470,14 @@ def _dates(shown: Observations, passes: Sequence[BoolArray], count: int) -> IntA
 
 def _cut_out(
     images: _Images, adjustment: BlockAdjustment, chosen: _Chosen, work: Work, progress: Progress
-) -> tuple[ControlPoints, Callable[[int], ChipArray]]:
-    """The chosen points as control points of one chip file, and the chips of each."""
+) -> tuple[ControlPoints, Callable[[int], ChipArray], Mapping[str, int]]:
+    """The chosen points as those of one chip file, the chips of each, and why surfaces are missing."""
     rows, n = chosen.rows, len(chosen.rows)
     scenes, places, options = images.placed(adjustment), adjustment.lon_lat_h[rows], images.options
-    surface = surfaces_at(
-        scenes, places, options.surface_pairs, work=work, progress=part_of(progress, 0.0, 0.5)
+    of_models_m2, search = adjustment.point_shared_m2[rows, 2, 2], part_of(progress, 0.0, 0.5)
+    surface, missing = surfaces_at(
+        scenes, places, options.surface_pairs, of_models_m2=of_models_m2, work=work, progress=search
     )
-    # A surface is made with the models of the block, and takes over what they are off by together.
-    of_models_m2 = adjustment.point_shared_m2[rows, 2, 2]
-    surface = replace(surface, sigma_m=np.sqrt(surface.sigma_m**2 + of_models_m2))
     cut = cut_points(
         scenes, places, chosen.shown, options.gsds_m, work=work, progress=part_of(progress, 0.5, 0.5)
     )
@@ -494,4 +495,4 @@ def _cut_out(
         chip_files=("chips",),
         surface=surface,
     )
-    return points, cut.chips
+    return points, cut.chips, missing

@@ -1,5 +1,6 @@
 """Content of the report on the adjustment of a block: its images, its control, its points."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -41,6 +42,7 @@ class AdjustmentReport:
         lon_lat_h: (n, 3) the points.
         sigma_m: (n, 3) their standard deviations, in the frame of the block.
         points: how they fit.
+        without_surface: number of points without a height of the surface, by the reason.
         finished_at: UTC.
         software_version: of Amers.
     """
@@ -56,6 +58,7 @@ class AdjustmentReport:
     lon_lat_h: Array
     sigma_m: Array
     points: PointFits
+    without_surface: Mapping[str, int]
     finished_at: datetime
     software_version: str
 
@@ -68,6 +71,11 @@ class AdjustmentReport:
     def left_out(self) -> list[ControlFit]:
         """The control that contradicts the rest."""
         return [one for one in self.control if not one.used]
+
+    @property
+    def without_surface_words(self) -> str:
+        """How many points have no height of the surface and why, as one line; "" where all have one."""
+        return without_surface_words(self.without_surface, len(self.lon_lat_h))
 
     @property
     def verdict(self) -> str:
@@ -102,9 +110,18 @@ class AdjustmentReport:
             "slope_factor": self.slope_factor,
             "images": self.images,
             "control": self.control,
+            "points_without_surface": dict(self.without_surface),
             "finished_at": self.finished_at,
             "software_version": self.software_version,
         }
+
+
+def without_surface_words(missing: Mapping[str, int], points: int) -> str:
+    """How many of some points have no height of the surface and why, as one line; "" for none."""
+    if not missing:
+        return ""
+    reasons = "; ".join(f"{reason}: {count:,}" for reason, count in missing.items())
+    return f"{sum(missing.values()):,} of {points:,} have no height of the surface ({reasons})"
 
 
 def adjustment_report(
@@ -137,6 +154,7 @@ def adjustment_report(
         lon_lat_h=production.points.lon_lat_h,
         sigma_m=np.sqrt(np.diagonal(production.points.covariance_m2, 0, 1, 2)),
         points=production.point_fits,
+        without_surface=production.without_surface,
         finished_at=finished_at,
         software_version=software_version,
     )

@@ -200,6 +200,8 @@ def test_the_adjustment_is_reported_image_by_image_and_point_by_point(images, bl
     assert {image["verdict"] for image in report["images"]} == {"fits"}
     assert all(0.5 * image["measures"] < image["used"] for image in report["images"])
     assert report["on_the_earth"]["words"].startswith("CE90")
+    surface = production.points.surface
+    assert sum(report["points_without_surface"].values()) == int(np.isnan(surface.height_m).sum())
     lines = (folder / "points.csv").read_text().splitlines()
     assert len(lines) == 1 + len(production.points)
     columns = dict(zip(lines[0].split(","), lines[1].split(","), strict=True))

@@ -18,10 +18,11 @@ from amers.services.imagery.source import ArrayImage, Window, render_chip
 from amers.services.matching.correlate import FOUND, CorrelationOptions, find_chip
 from amers.services.matching.ground_features import FeatureOptions
 from amers.services.production.image_production import Production, ProductionOptions, produce_points
-from amers.services.production.point_surfaces import surfaces_at
+from amers.services.production.point_surfaces import NOT_ASKED, surfaces_at
 from amers.services.production.tie_points import find_tie_points
 from amers.services.simulation.view import SimulatedView, ViewPlan, simulate_block, simulate_view
 from amers.services.simulation.world import World, make_world
+from amers.services.surface.match import REASON_LABELS, Reason
 from amers.services.tasks import Work
 from amers.services.types import Array, Observations, no_progress
 from tests.services.simulated import (
@@ -174,9 +175,11 @@ def test_no_surface_is_stated_without_a_pair_or_where_none_is_asked_for() -> Non
     places = production().points.lon_lat_h[:3]
     scenes = [view.as_scene(BLOCK_SIGMA_M) for view in block_views()]
     for shown, pairs in ((scenes[:1], 10), (scenes, 0)):
-        found = surfaces_at(shown, places, pairs, work=Work(), progress=no_progress)
+        found, why = surfaces_at(shown, places, pairs, work=Work(), progress=no_progress)
         assert np.isnan(found.height_m).all()
         assert np.isnan(found.sigma_m).all()
+        reason = NOT_ASKED if pairs == 0 else REASON_LABELS[Reason.OUTSIDE]
+        assert why == {reason: len(places)}
 
 
 def test_points_far_apart_have_the_same_surface_as_those_of_a_whole() -> None:
@@ -190,7 +193,7 @@ def test_points_far_apart_have_the_same_surface_as_those_of_a_whole() -> None:
     known = np.flatnonzero(np.isfinite(made.points.surface.height_m))
     assert len(known) > 0.9 * len(places)
     rows = known[[places[known, axis].argmin() for axis in (0, 1)] + [places[known, 0].argmax()]]
-    alone = surfaces_at(scenes, places[rows], 10, work=Work(), progress=no_progress)
+    alone, _ = surfaces_at(scenes, places[rows], 10, work=Work(), progress=no_progress)
     off_m = alone.height_m - made.points.surface.height_m[rows]
     assert (np.abs(off_m) < np.maximum(1.0, 2.0 * alone.sigma_m)).all()
 

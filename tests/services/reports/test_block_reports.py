@@ -2,6 +2,7 @@
 
 import csv
 import io
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -113,6 +114,7 @@ def adjusted(odd: int = 0, contradicting: int = 0, control: int = 3) -> Adjustme
         lon_lat_h=np.array([[5.0, 43.0, 100.0], [6.0, 44.0, 200.0]]),
         sigma_m=np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]),
         points=PointFits(np.array([3, 4]), np.array([2, 4]), np.array([0.1, 0.2]), np.array([0.3, 0.4])),
+        without_surface={"no texture": 1},
         finished_at=WHEN,
         software_version="0.1.0",
     )
@@ -146,6 +148,10 @@ def test_the_document_of_an_adjustment_has_residuals_before_and_after_and_no_unk
     document = report_document(adjusted())
     assert document["residuals_px"] == {"delivered": 9.0, "adjusted": 0.3, "points": 0.2}
     assert document["control"][0]["misfit_m"] == [0.5, -0.5, None]
+    assert document["points_without_surface"] == {"no texture": 1}
+    words = "1 of 2 have no height of the surface (no texture: 1)"
+    assert adjusted().without_surface_words == words
+    assert replace(adjusted(), without_surface={}).without_surface_words == ""
     assert document["on_the_earth"]["le90_m"] > document["relative_to_control_points"]["le90_m"]
 
 
