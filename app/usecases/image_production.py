@@ -70,10 +70,12 @@ class WorkPlace:
         folder: of the results of all tasks, so that an interrupted production continues; by default next
             to the block, until the block is complete.
         compute: processes or a cluster.
+        most_bytes: that these results may take; None for any.
     """
 
     folder: Path | None = None
     compute: ComputeOptions = field(default_factory=ComputeOptions)
+    most_bytes: int | None = None
 
 
 def run_image_production(
@@ -110,7 +112,7 @@ def run_image_production(
         work_folder = place.folder or folder.with_name(f"{folder.name}.work")
         control = read_control(images.control, scenes, files, stack)
         ground = read_ground(images.ground)
-        kept = WorkFolder(work_folder, _inputs(scenes, files, images, options))
+        kept = WorkFolder(work_folder, _inputs(scenes, files, images, options), place.most_bytes)
         executor, ahead = stack.enter_context(open_executor(place.compute))
         work = Work(executor, kept, ahead)
         production = produce_points(

@@ -137,7 +137,7 @@ def run_mosaic(
     form = read[0].form
     with ExitStack() as stack:
         folder = place.folder or output.with_name(f"{output.name}.work")
-        kept = WorkFolder(folder, _inputs(read, ground, options, wanted))
+        kept = WorkFolder(folder, _inputs(read, ground, options, wanted), place.most_bytes)
         executor, ahead = stack.enter_context(open_executor(place.compute))
         work = Work(executor, kept, ahead)
         mosaic = make_mosaic(layout, terrain, options, work=work, progress=part_of(progress, 0.0, 0.5))

@@ -180,7 +180,7 @@ def write_surface(
     """
     opened = [one.scene for one in scenes]
     folder = place.folder or output.with_name(f"{output.name}.work")
-    kept = WorkFolder(folder, surface_inputs(scenes, options))
+    kept = WorkFolder(folder, surface_inputs(scenes, options), place.most_bytes)
     with open_executor(place.compute) as (executor, ahead):
         work = Work(executor, kept, ahead)
         surface = make_surface(

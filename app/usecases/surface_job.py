@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import shutil
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -144,6 +145,8 @@ def _run(work: Work) -> Commit:
         opened = [one.scene for one in scenes]
         grid = surface_grid(opened, options)
         MapLimits(room).check(opened, grid, _CELL_BYTES)
+        free_bytes = shutil.disk_usage(kept).free - work.settings.min_free_bytes
+        most_bytes = max(free_bytes if room is None else min(room, free_bytes), 0)
         # Another version, or other models, would not go on from the same results.
         facts = json.dumps(surface_inputs(scenes, options), sort_keys=True)
         surface = write_surface(
@@ -151,7 +154,7 @@ def _run(work: Work) -> Commit:
             folder / SURFACE_NAME,
             options,
             grid=grid,
-            place=WorkPlace(kept / hashlib.sha256(facts.encode()).hexdigest()),
+            place=WorkPlace(kept / hashlib.sha256(facts.encode()).hexdigest(), most_bytes=most_bytes),
             progress=work.progress,
         )
         on_map = map_values(surface.path)

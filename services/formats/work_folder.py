@@ -18,17 +18,18 @@ _INPUTS = "inputs.json"
 class WorkFolder(MutableMapping[str, Arrays]):
     """Results of tasks in files: a folder for each, a file for every array, read when asked for."""
 
-    def __init__(self, folder: Path, inputs: Mapping[str, Any]) -> None:
+    def __init__(self, folder: Path, inputs: Mapping[str, Any], most_bytes: int | None = None) -> None:
         """Open a folder, or make it.
 
         Args:
             folder: of the results.
             inputs: what all results depend on, as JSON.
+            most_bytes: that the results may take; None for any.
 
         Raises:
             InputError: the folder has the results of other inputs, or is something else.
         """
-        self.folder = folder
+        self.folder, self.most_bytes = folder, most_bytes
         stated = json.dumps(inputs, indent=1, sort_keys=True, default=str)
         file = folder / _INPUTS
         if folder.exists() and not file.is_file() and any(folder.iterdir()):
@@ -46,6 +47,7 @@ class WorkFolder(MutableMapping[str, Arrays]):
             partial = folder / f".{_INPUTS}.{uuid.uuid4().hex}"
             partial.write_text(stated, encoding="utf-8")
             partial.rename(file)
+        self._bytes = sum(path.stat().st_size for path in folder.rglob("*.npy"))
 
     def __getitem__(self, name: str) -> Arrays:
         """Arrays of a result, mapped into memory."""
@@ -63,7 +65,18 @@ class WorkFolder(MutableMapping[str, Arrays]):
         return arrays
 
     def __setitem__(self, name: str, arrays: Arrays) -> None:
-        """Write a result beside its place, then put it there."""
+        """Write a result beside its place, then put it there.
+
+        Raises:
+            InputError: the results would take more than they may.
+        """
+        self._bytes += sum(values.nbytes for values in arrays.values())
+        if self.most_bytes is not None and self._bytes > self.most_bytes:
+            raise InputError(
+                f"intermediate results would take more than the {self.most_bytes:,} bytes that are left "
+                "for them: make less at once (larger cells, fewer pairs, a smaller area), or free room "
+                "on the disk or in the quota"
+            )
         place = self.folder / name
         partial = place.with_name(f".{place.name}.{uuid.uuid4().hex}")
         partial.mkdir(parents=True)

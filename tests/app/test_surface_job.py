@@ -28,6 +28,7 @@ from tests.app.ledger import job_runner, make_token
 from tests.app.surface_world import OFF_PX, OPTIONS, write_pair, write_registrations
 
 MADE = {"gsd_m": OPTIONS.gsd_m, "heights_m": OPTIONS.heights_m}
+ROOM_FOR_THE_MAP_BYTES = 1_000_000
 TIFF = b"II*\0" + bytes(100)
 FILES = ("correction.json", "refined_RPC.TXT")
 
@@ -150,6 +151,18 @@ def test_a_surface_that_the_quota_does_not_hold_is_not_begun(
     job = run("make-surface", scenes=uploaded(me, folder), **MADE)
     assert (job["status"], job["error"]["error"]) == ("failed", "TooLarge")
     assert "left of the storage quota" in job["error"]["detail"]
+
+
+def test_what_is_kept_meanwhile_counts_like_what_is_stored(
+    client: TestClient, bearer: Bearer, settings: Settings, database: Database, folder: Path
+) -> None:
+    """Cells of 1 m make a small map, and are matched with all pixels."""
+    used = sum((folder / f"{look}.tif").stat().st_size for look in ("left", "right"))
+    me = make_token(client, bearer("admin"), storage_quota_bytes=used + ROOM_FOR_THE_MAP_BYTES)
+    run = job_runner(client, database, settings, me)
+    job = run("make-surface", scenes=uploaded(me, folder), **{**MADE, "gsd_m": 1.0})
+    assert (job["status"], job["error"]["error"]) == ("failed", "InputError")
+    assert "intermediate results would take more than" in job["error"]["detail"]
 
 
 def test_an_attempt_goes_on_from_what_a_lost_one_has_matched(

@@ -36,6 +36,15 @@ def test_results_of_other_inputs_are_refused_by_name(tmp_path: Path) -> None:
         WorkFolder(tmp_path / "work", {**INPUTS, "images": ["a.tif", "c.tif"]})
 
 
+def test_results_take_no_more_than_they_may_with_those_that_are_there(tmp_path: Path) -> None:
+    WorkFolder(tmp_path / "work", INPUTS)["pairs/1"] = {"first": np.zeros(1000)}
+    again = WorkFolder(tmp_path / "work", INPUTS, most_bytes=20_000)
+    again["pairs/2"] = {"first": np.zeros(1000)}
+    with pytest.raises(InputError, match=r"more than the 20,000 bytes"):
+        again["pairs/3"] = {"first": np.zeros(1000)}
+    assert list(again) == ["pairs/1", "pairs/2"]
+
+
 def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "letter.txt").write_text("dear")
     with pytest.raises(InputError, match=r"not a work folder"):
