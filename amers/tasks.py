@@ -13,9 +13,11 @@ from numpy.typing import ArrayLike
 
 from amers.app.usecases.executors import ComputeOptions
 from amers.app.usecases.image_production import ProductionImages, WorkPlace, run_image_production
+from amers.app.usecases.marked_files import PointStatements
 from amers.app.usecases.new_block import BlockIdentity
 from amers.app.usecases.orthorectification import OrthoMap, Orthorectified, run_orthorectification
 from amers.app.usecases.registered_scene import SceneModel
+from amers.app.usecases.registration.control_marks import MarkFiles, read_control_marks
 from amers.app.usecases.registration.control_sources import points_of_block
 from amers.app.usecases.registration.on_marks import Refinement, read_marks, refine_on_marks, written
 from amers.app.usecases.registration.reference_source import (
@@ -55,6 +57,7 @@ from amers.opened import (
     rows_of,
 )
 from amers.services.errors import AmersError, InputError
+from amers.services.formats.gcp.reader import StatedByCaller
 from amers.services.formats.sensor_models.rpc_files import ImageFiles
 from amers.services.formats.vector.pixel_coordinates import PixelOrigin
 from amers.services.misfit.affine_fit import Order
@@ -62,6 +65,7 @@ from amers.services.orthorectification.rectify import OrthoOptions
 from amers.services.production.image_production import ProductionOptions
 from amers.services.quality.check_points import MARKING_SIGMA_PX, CheckPoints
 from amers.services.quality.qualification import QualificationOptions
+from amers.services.registration.on_marks import register_on_marks
 from amers.services.registration.on_points import Registration, register_scene
 from amers.services.registration.options import RegistrationOptions
 from amers.services.reports.joint import JointReport
@@ -137,24 +141,36 @@ def refine(
     return written(refinement, files.image, files.model, content, Path(folder))
 
 
-def register(
+def register(  # noqa: PLR0913 - options by keyword, as those of the command
     scene: Scene | FilePath,
-    block: Block | FilePath,
+    block: Block | FilePath | None = None,
     folder: FilePath | None = None,
     *,
+    control: FilePath | Sequence[FilePath] | None = None,
+    control_heights: str | None = None,
+    control_sigma_m: tuple[float, float] | None = None,
+    control_frame_sigma_m: tuple[float, float] | None = None,
     check_points: FilePath | None = None,
     max_points: int = 500,
     max_ce90_on_earth_m: float | None = None,
     copy_image: bool = False,
     progress: Progress = no_progress,
 ) -> Registration:
-    """Refine the model of a scene on the control points of a block.
+    """Refine the model of a scene on the control points of a block, on your own marks, or on both.
 
     Args:
         scene: the scene or its path.
-        block: the block or its folder.
+        block: the block or its folder. By default none: the scene is registered on marks alone.
         folder: for the refined model, the report and the residuals; an older result in it is replaced as
             a whole, and a failure leaves the folder as it is. By default nothing is written.
+        control: file of ground points that you marked in the image, in any format that `refine` reads,
+            or several; one mark is enough, and check points in it are held out. By default none.
+        control_heights: vertical datum of these heights, as `heights` of `refine`. By default the file
+            has to state it.
+        control_sigma_m: horizontal and vertical standard deviation of this ground where its file states
+            none, metres. By default one pixel.
+        control_frame_sigma_m: horizontal and vertical standard deviation of the error on the Earth that
+            all this ground shares, metres. By default it is unknown.
         check_points: file of marked points that are held out, and lower the verdict when the result
             contradicts them; needs a folder. By default none.
         max_points: largest number of points that are tried, well spread over the image; more take
@@ -166,21 +182,33 @@ def register(
         progress: receives the fraction done and a message. By default nothing does.
 
     Returns:
-        With `model`, and with the verdict, the criteria and the accuracy in `qualification`.
+        With `model`, with the verdict, the criteria and the accuracy in `qualification`, and with what
+        became of each mark, and where one more would help most, in `marks`.
 
     Raises:
-        InputError: the scene, the block or the folder cannot be used.
+        InputError: the scene, the block, the marks or the folder cannot be used.
         ComputationError: the scene cannot be registered.
     """
     limits = QualificationOptions(max_ce90_on_earth_m=max_ce90_on_earth_m)
     options = RegistrationOptions(max_points=max_points, qualification=limits)
+    marks = _mark_files(control, control_heights, control_sigma_m, control_frame_sigma_m)
+    if block is None and marks is None:
+        raise InputError("register: a block, marks (control), or both are expected")
     if folder is not None:
-        sources = ControlSources(points_of_block(_folder_of(block)))
+        points = None if block is None else points_of_block(_folder_of(block))
+        sources = ControlSources(points, marks=marks)
         outputs = _Outputs(Path(folder), check_points, copy_image)
         return _registered(scene, sources, outputs, options, progress)
     _refuse_without_folder(check_points, copy_image)
-    control, content = as_block(block), as_scene(scene).content
-    return register_scene(content, control.points, control.chips, options, progress=progress)
+    opened = as_scene(scene)
+    content, own = opened.content, None
+    if marks is not None:
+        own = read_control_marks(marks, opened.files.image, content).control
+    if block is None:
+        assert own is not None
+        return register_on_marks(content, own, options)
+    base = as_block(block)
+    return register_scene(content, base.points, base.chips, options, marks=own, progress=progress)
 
 
 def register_on_reference(
@@ -481,6 +509,20 @@ def _registered(
             files, sources, new, options=options, copy_image=copy_image, progress=progress
         )
     return run.registration
+
+
+def _mark_files(
+    control: FilePath | Sequence[FilePath] | None,
+    heights: str | None,
+    sigma_m: tuple[float, float] | None,
+    frame_sigma_m: tuple[float, float] | None,
+) -> MarkFiles | None:
+    """Files of marks, with what the caller states of them; None without any."""
+    if control is None:
+        return None
+    paths = (control,) if isinstance(control, FilePath) else tuple(control)
+    points = PointStatements(StatedByCaller(heights), sigma_m, frame_sigma_m)
+    return MarkFiles(tuple(Path(path) for path in paths), points)
 
 
 def _refuse_without_folder(check_points: FilePath | None, copy_image: bool) -> None:

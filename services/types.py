@@ -306,6 +306,10 @@ class Measures:
     active: BoolArray
     reason: npt.NDArray[np.str_]
 
+    def take(self, rows: IntArray | BoolArray) -> "Measures":
+        """The results of some of the points."""
+        return Measures(**{name: values[rows] for name, values in vars(self).items()})
+
     def status(self, row: int) -> str:
         """The status of a point: "active", "deactivated" or "not matched"."""
         if self.active[row]:

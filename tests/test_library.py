@@ -241,8 +241,8 @@ def test_scenes_of_one_name_are_refused_before_any_work():
             amers.register_together(names, "block", "together")
 
 
-def test_there_are_twelve_recipes_of_some_ten_lines():
-    assert len(RECIPES) == 13 + len(["Errors"])
+def test_there_are_fourteen_recipes_of_some_ten_lines():
+    assert len(RECIPES) == 14 + len(["Errors"])
     assert [name for name, program in RECIPES.items() if len(program.splitlines()) > 10] == []
 
 

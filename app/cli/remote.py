@@ -6,6 +6,7 @@ from typing import Any
 
 from amers.app.client import Client, Job, JobFailed, ServiceFailure
 from amers.app.errors import AmersError, ComputationError, InputError
+from amers.app.usecases.registration.control_marks import MarkFiles
 from amers.app.usecases.registration.register import SceneFiles
 from amers.services import errors
 from amers.services.formats.images.scenes import model_files
@@ -22,6 +23,7 @@ def register(
     folder: Path,
     progress: Progress,
     *,
+    marks: MarkFiles | None = None,
     copy_image: bool = False,
     max_ce90_on_earth_m: float | None = None,
 ) -> dict[str, Any]:
@@ -32,6 +34,7 @@ def register(
         files: of the scene.
         folder: for the outputs.
         progress: receives the fraction done and a message.
+        marks: of a person in the scene.
         copy_image: also copy a GeoTIFF, with the refined model in its tags.
         max_ce90_on_earth_m: see `QualificationOptions`.
 
@@ -47,11 +50,18 @@ def register(
     # The model is read to check it before anything is sent.
     models = model_files(files.image, files.model)
     image = files_to_send(files.image)[0]
-    optional_files = [path for path in (files.mask, files.check_points) if path is not None]
+    of_marks = {} if marks is None else _inputs_of_marks(marks)
+    control = None if marks is None else marks.paths[0]
+    optional_files = [path for path in (files.mask, files.check_points, control) if path is not None]
     upload_progress = part_of(progress, 0.0, UPLOAD_SHARE)
     scene = client.upload_scene(image, sigma_m=files.sigma_m, progress=upload_progress)
     names = {path: client.upload_file(scene, path) for path in [*models, *optional_files]}
-    paths = {"model": files.model, "mask": files.mask, "check_points": files.check_points}
+    paths = {
+        "model": files.model,
+        "mask": files.mask,
+        "check_points": files.check_points,
+        "control": control,
+    }
     values = {"bands": files.bands, "check_heights": files.check_heights}
     if files.crop_origin is not None:
         values["crop_origin"] = "{},{}".format(*files.crop_origin)
@@ -60,6 +70,7 @@ def register(
         "copy_image": copy_image,
         **{name: names[path] for name, path in paths.items() if path is not None},
         **{name: value for name, value in values.items() if value is not None},
+        **of_marks,
     }
     if max_ce90_on_earth_m is not None:
         inputs["options"] = {"qualification": {"max_ce90_on_earth_m": max_ce90_on_earth_m}}
@@ -72,6 +83,30 @@ def register(
     client.download(job, folder)
     report: dict[str, Any] = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     return report
+
+
+def _inputs_of_marks(marks: MarkFiles) -> dict[str, Any]:
+    """The inputs of the process that state what a file of marks does not.
+
+    Raises:
+        InputError: the service cannot be told so much.
+    """
+    points = marks.points
+    if len(marks.paths) > 1:
+        raise InputError(f"--control: {len(marks.paths)} files found; a service takes one of a scene")
+    heights = points.stated.heights
+    if isinstance(heights, Path) or points.stated.csv.crs or points.stated.csv.columns:
+        raise InputError(
+            "--server: state the heights of marks with --control-vertical, and give longitude and "
+            "latitude; leave out --control-geoid, --control-crs and --control-columns"
+        )
+    inputs = {
+        "control_heights": heights,
+        "control_sigma_m": points.sigma_m,
+        "control_frame_sigma_m": points.frame_sigma_m,
+        "control_mark_sigma_px": points.mark_sigma_px,
+    }
+    return {name: value for name, value in inputs.items() if value is not None}
 
 
 def _failure(job: Job) -> AmersError | ServiceFailure:

@@ -143,7 +143,7 @@ class WorkOptions:
     server: str | None = None
     token: Annotated[str | None, typer.Option(envvar="AMERS_TOKEN")] = None
 
-    def remote(self, control: ControlOptions, marks: MarkFiles | None) -> Remote | None:
+    def remote(self, control: ControlOptions) -> Remote | None:
         """The service; None without any.
 
         Raises:
@@ -156,8 +156,6 @@ class WorkOptions:
                 "--server: the service uses its own points and references; leave out --block and "
                 "--reference"
             )
-        if marks is not None:
-            raise InputError("--server: marks are files of this machine; leave out --control")
         if self.jobs > 1:
             raise InputError(
                 "--jobs: the workers of the service do the jobs; leave it out with --server"
@@ -196,7 +194,7 @@ def register(
     images = images_of(scenes)
     is_one_scene = len(scenes) == len(images) == 1 and not scenes[0].is_dir()
     mark_files = marks.files(of_many=len(images) > 1)
-    remote = work.remote(control, mark_files)
+    remote = work.remote(control)
     refuse_shared_files(images, options.files_of_one)
     control_files = control.files(mark_files)
     models_of = models.of(images)

@@ -167,7 +167,8 @@ def _register_accepted(
     try:
         if remote is not None:
             with Client(remote.url, remote.token) as client:
-                return [outcome_of(_on_service(client), request) for request in requests]
+                on_service = _on_service(client, control.marks)
+                return [outcome_of(on_service, request) for request in requests]
         if len(requests) == 1:
             with registrar(control) as register_one:
                 return [outcome_of(register_one, requests[0])]
@@ -356,13 +357,14 @@ def _on_store(database: Database, settings: Settings) -> Register:
     return register_one
 
 
-def _on_service(client: Client) -> Register:
+def _on_service(client: Client, marks: MarkFiles | None) -> Register:
     """A function that lets a service register scenes."""
     return lambda request, folder, progress: register(
         client,
         request.files,
         folder,
         progress,
+        marks=marks,
         copy_image=request.copy_image,
         max_ce90_on_earth_m=request.max_ce90_on_earth_m,
     )

@@ -7,6 +7,7 @@ from amers.app.db.engine import Connection
 from amers.app.db.history import PointHistory
 from amers.app.errors import Conflict, InputError, NotFound
 from amers.services.registration.on_points import Registration
+from amers.services.registration.scene_marks import without_marks
 
 MOST_HISTORIES = 1000
 LONGEST_REASON = 500
@@ -19,7 +20,7 @@ def record_measures(
 
     A registration with the verdict "failed" does not count: its model may be wrong, and then the wrong
     points look good. A second registration of the same scene does not count either: it adds no
-    information about the points.
+    information about the points. Marks of a person are no points of the store, and are left out.
 
     Args:
         connection: with the transaction that stores the registration.
@@ -27,8 +28,11 @@ def record_measures(
         registration: on points of the store.
         scene_key: identifies the image; equal for equal images.
     """
-    history.insert_measures(connection, registration_id, registration.measures)
-    history.insert_views(connection, registration_id, registration.measures, registration.views)
+    measures = without_marks(registration.measures)
+    if not len(measures.point_id):
+        return
+    history.insert_measures(connection, registration_id, measures)
+    history.insert_views(connection, registration_id, measures, registration.views)
     if registration.qualification.verdict == "failed":
         return
     if registrations.claim_scene(connection, registration_id, scene_key):

@@ -24,6 +24,7 @@ from amers.services.geodesy import ecef_from_lon_lat_h
 from amers.services.imagery.scene import Scene, scene_footprint
 from amers.services.matching.reference_image import ReferenceMatchingOptions
 from amers.services.registration.on_points import Registration
+from amers.services.registration.scene_marks import without_marks
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.types import Acquisition, Array, BoolArray
 
@@ -138,7 +139,7 @@ def record_places(
         return
     if not references.lock_reference(connection, covering.id):
         return
-    measures = registration.measures
+    measures = without_marks(registration.measures)
     is_tried = np.isfinite(measures.lon_lat_h).all(axis=1)
     is_tried &= ~np.isin(measures.reason, ("nodata", "saturated"))
     earlier = references.places_inside(connection, covering.id, outline, worthwhile=False)

@@ -35,7 +35,7 @@ MODEL_SUFFIXES = (
     *(".dim", ".til", ".imd", ".tfw", ".j2w", ".prj"),
 )
 """Models, and what places an image in a product or on a map."""
-MARK_SUFFIXES = (".geojson", ".json", ".gcp", ".points", ".pts")
+MARK_SUFFIXES = (".geojson", ".json", ".gcp", ".points", ".pts", ".csv")
 RASTER_SUFFIXES = (".tif", ".tiff", ".jp2", ".ntf", ".nitf", ".msk", ".gtx")
 """Terrains, masks, geoid grids and other tiles of the image: they may be as large as images."""
 VECTOR_SUFFIXES = (".fgb",)

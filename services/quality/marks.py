@@ -157,8 +157,7 @@ def marks_beside_points(scene: AdjustedScene, names: Sequence[str], sigma_m: Arr
     """
     n = len(names)
     rows = np.arange(len(scene.measures.point_id) - n, len(scene.measures.point_id))
-    columns = {name: getattr(scene.measures, name)[rows] for name in vars(scene.measures)}
-    of_marks = replace(scene, measures=replace(scene.measures, **columns))
+    of_marks = replace(scene, measures=scene.measures.take(rows))
     adjustment = scene.adjustment
     measures = of_marks.measures
     derivative = scene.model.project_derivative(measures.lon_lat_h)

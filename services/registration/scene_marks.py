@@ -9,7 +9,16 @@ from amers.services.imagery.scene import Scene
 from amers.services.misfit.scene_adjustment import AdjustmentOptions, SceneAdjustment
 from amers.services.registration.search import Search, adjust_search
 from amers.services.statements import Statements
-from amers.services.types import Array, ChipArray, ControlPoints, Frame, IntArray, SurfaceHeights, Views
+from amers.services.types import (
+    Array,
+    ChipArray,
+    ControlPoints,
+    Frame,
+    IntArray,
+    Measures,
+    SurfaceHeights,
+    Views,
+)
 
 
 @dataclass(frozen=True)
@@ -74,6 +83,11 @@ class NoChips:
     def read(self, file: str, row: int, count: int) -> ChipArray:
         """No chips (0, 101, 101)."""
         return np.zeros((0, 101, 101), dtype=np.uint16)
+
+
+def without_marks(measures: Measures) -> Measures:
+    """The measures of a registration but for those of marks."""
+    return measures.take(measures.point_id >= 0)
 
 
 def with_marks(points: ControlPoints, marks: SceneMarks) -> ControlPoints:

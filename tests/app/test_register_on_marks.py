@@ -130,7 +130,10 @@ def test_several_files_are_one_set_of_marks(image):
     ("words", "said"),
     [
         (["--control-sigma-m", "3,5"], "--control-sigma-m: of --control, which is missing; add it"),
-        (["--control", "MARKS", "--server", "http://localhost"], "--server: marks are files of this"),
+        (
+            ["--control", "MARKS", "--server", "http://localhost", "--control-crs", "EPSG:32631"],
+            "--server: state the heights of marks with --control-vertical, and give longitude and",
+        ),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(image, words, said):

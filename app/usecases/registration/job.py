@@ -15,9 +15,11 @@ from amers.app.db.scenes import SceneRow
 from amers.app.db.tokens import Token
 from amers.app.errors import AmersError, ComputationError, InputError, TooLarge, is_no_memory
 from amers.app.usecases.damage import suspecting_damage
+from amers.app.usecases.marked_files import PointStatements
 from amers.app.usecases.model_choice import parse_crop_origin
 from amers.app.usecases.processes import Commit, Process, Work, WorkFailed
 from amers.app.usecases.references import references_of_store
+from amers.app.usecases.registration.control_marks import MarkFiles
 from amers.app.usecases.registration.control_sources import points_of_store
 from amers.app.usecases.registration.deliverables import OUTPUTS
 from amers.app.usecases.registration.register import (
@@ -32,14 +34,16 @@ from amers.app.usecases.results import store_results
 from amers.app.usecases.scene_inputs import check_file_names, check_scene, naming, present_scene
 from amers.app.usecases.scenes import local_image, stored_keys
 from amers.services.formats.gcp.marked_points import check_heights
+from amers.services.formats.gcp.reader import StatedByCaller
 from amers.services.formats.images.bands import parse_bands
 from amers.services.quality.accuracy_statement import accuracy_document
 from amers.services.registration.options import RegistrationOptions
 from amers.services.reports.failure import NO_ACCURACY, NOT_REGISTERED
 from amers.services.reports.report import Method as ReportedMethod
 
-Method = Literal["auto", "points", "reference"]
-"""What a scene is registered on: control points, a reference image, or the first of both that exists."""
+Method = Literal["auto", "points", "reference", "marks"]
+"""What a scene is registered on: control points, a reference image, or the first of both that exists;
+or marks of a person alone."""
 
 
 @dataclass(frozen=True)
@@ -50,12 +54,21 @@ class RegisterScene:
         scene: id of an uploaded scene.
         sigma_m: accuracy of its model, metres (1 sigma); by default that stated at the upload.
         model: name of the file with the scene's model; by default it is found by its name.
-        method: "points", "reference", or "auto": on points, and where there are none on a reference.
+        method: "points", "reference", or "auto": on points, and where there are none on a reference; or
+            "marks": on the marks of `control` alone.
         bands: bands to use, such as "2" or "1,2,3" or "3:0.3,2:0.7"; by default the panchromatic band or
             the mean of the visible ones.
         mask: name of an image of the same ground; pixels are not used where it is not zero.
         check_points: name of a file with points that are held out of the registration.
         check_heights: vertical datum of the check points' heights, where their format cannot state it.
+        control: name of a file with ground points that a person marked in the scene: observations of the
+            same adjustment, and what the scene is registered on where nothing else shows it.
+        control_heights: vertical datum of these heights, where the file does not state it.
+        control_sigma_m: accuracy of this ground where the file states none: horizontal and up, metres (1
+            sigma); by default one pixel.
+        control_frame_sigma_m: error on the Earth that all this ground shares: horizontal and up, metres
+            (1 sigma); by default unknown.
+        control_mark_sigma_px: sigma of marks whose file states none, pixels; by default 0.5.
         crop_origin: LINE,SAMPLE of the image's first pixel in the image that the model is for; by
             default as its files state it.
         copy_image: whether a GeoTIFF is copied to the outputs with the refined model in its tags.
@@ -70,6 +83,11 @@ class RegisterScene:
     mask: str | None = None
     check_points: str | None = None
     check_heights: str | None = None
+    control: str | None = None
+    control_heights: str | None = None
+    control_sigma_m: tuple[float, float] | None = None
+    control_frame_sigma_m: tuple[float, float] | None = None
+    control_mark_sigma_px: float | None = None
     crop_origin: str | None = None
     copy_image: bool = False
     options: RegistrationOptions = field(default_factory=RegistrationOptions)
@@ -77,7 +95,7 @@ class RegisterScene:
 
 def _check(connection: Connection, caller: Token, inputs: RegisterScene) -> None:
     check_scene(connection, caller, inputs.scene)
-    check_file_names(inputs, "model", "mask", "check_points")
+    check_file_names(inputs, "model", "mask", "check_points", "control")
     if inputs.sigma_m is not None and not 0.0 < inputs.sigma_m < inf:
         raise InputError(f"sigma_m: {inputs.sigma_m} found, metres above 0 expected")
     if inputs.bands is not None:
@@ -87,6 +105,30 @@ def _check(connection: Connection, caller: Token, inputs: RegisterScene) -> None
     if inputs.check_heights is not None:
         with naming("check_heights"):
             check_heights(inputs.check_heights)
+    _check_marks(inputs)
+
+
+def _check_marks(inputs: RegisterScene) -> None:
+    """Refuse what is stated of marks that are not given, or is no accuracy."""
+    if inputs.control_heights is not None:
+        with naming("control_heights"):
+            check_heights(inputs.control_heights)
+    sigmas = {
+        "control_sigma_m": inputs.control_sigma_m,
+        "control_frame_sigma_m": inputs.control_frame_sigma_m,
+        "control_mark_sigma_px": inputs.control_mark_sigma_px,
+    }
+    stated = {name: value for name, value in sigmas.items() if value is not None}
+    if inputs.control is None:
+        alone = [*stated, *(["control_heights"] if inputs.control_heights is not None else [])]
+        if alone or inputs.method == "marks":
+            raise InputError(
+                f"{', '.join(alone) or 'method'}: of marks, whose file is missing: upload it beside the "
+                "image and name it with control"
+            )
+    for name, value in stated.items():
+        if not all(0.0 < one < inf for one in (value if isinstance(value, tuple) else (value,))):
+            raise InputError(f"{name}: {value} found, more than 0 expected")
 
 
 def _run(work: Work) -> Commit:
@@ -100,7 +142,7 @@ def _run(work: Work) -> Commit:
             with suspecting_damage(work.database, work.storage, stored_keys(scene)):
                 registered = run_registration(
                     scene_files(inputs, image, scene.sigma_m),
-                    _control_sources(work, inputs.method),
+                    _control_sources(work, inputs, image),
                     Path(folder),
                     options=inputs.options,
                     copy_image=inputs.copy_image,
@@ -170,13 +212,23 @@ def with_reports(
     return WorkFailed(error, {"verdict": NOT_REGISTERED, **values, "files": keys})
 
 
-def _control_sources(work: Work, method: Method) -> ControlSources:
-    """The sources of control in the store that a method allows."""
+def _control_sources(work: Work, inputs: RegisterScene, image: Path) -> ControlSources:
+    """The sources of control in the store that the method allows, and the marks beside the image."""
     points = points_of_store(work.database, work.storage)
     references = references_of_store(work.database, work.settings)
+    marks = None
+    if inputs.control is not None:
+        statements = PointStatements(
+            StatedByCaller(inputs.control_heights, options="--control-"),
+            inputs.control_sigma_m,
+            inputs.control_frame_sigma_m,
+            inputs.control_mark_sigma_px,
+        )
+        marks = MarkFiles((image.with_name(inputs.control),), statements)
     return ControlSources(
-        find_points=None if method == "reference" else points,
-        find_reference=None if method == "points" else references,
+        find_points=points if inputs.method in ("auto", "points") else None,
+        find_reference=references if inputs.method in ("auto", "reference") else None,
+        marks=marks,
     )
 
 
