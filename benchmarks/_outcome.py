@@ -45,6 +45,7 @@ class Outcome:
         ground_normalised: as `normalised`, on the Earth.
         wrong_share: of the image that is off by more than `WRONG` times the CE90 predicted there.
         judged_share: of the image: neither moved ground, nor shown twice. All else is left aside.
+        held_percent: share of the image that points hold: all figures of errors are of that part.
         line_gap_px: median distance along lines from an active point to the next.
         spacing_px: of the points that were searched, if they were evenly spread.
         followable: whether a distortion is smooth enough for that spacing: its shortest period is at
@@ -70,6 +71,7 @@ class Outcome:
     wrong_share: float = float("nan")
     judged_share: float = 1.0
     line_gap_px: float = float("nan")
+    held_percent: float = float("nan")
     spacing_px: float = float("nan")
     followable: bool = False
 
@@ -147,7 +149,9 @@ def _judged(
     scene: Scene, registration: Registration, truth: Truth, in_frame: Array, cpu_s: float
 ) -> Outcome:
     """The errors of a registration against the truth; the ground (n, 3) also as its points say."""
-    line_sample, shown = truth.line_sample, truth.on_earth
+    quality = registration.qualification
+    held = quality.coverage.holds(truth.line_sample)
+    line_sample, shown, in_frame = truth.line_sample[held], truth.on_earth[held], in_frame[held]
 
     def error_px(ground: Array) -> Array:
         return np.asarray(registration.model.project(ground) - line_sample)
@@ -168,7 +172,6 @@ def _judged(
     right = np.hypot(*on_ground_m(error).T) <= WRONG * local_m
     measures = registration.measures
     lines = np.sort(measures.line_sample[measures.active, 0])
-    quality = registration.qualification
     moved_m = [place.median_m for place in quality.stability.displacements]
     return Outcome(
         verdict=quality.verdict,
@@ -190,4 +193,5 @@ def _judged(
         wrong_share=float(1.0 - right.mean()),
         judged_share=truth.judged_share,
         line_gap_px=float(np.median(np.diff(lines))),
+        held_percent=quality.coverage.percent,
     )

@@ -106,18 +106,18 @@ def real_view(real_data: Path, name: str) -> RealView:
     of_others = [scenes[k].acquisition.image_id for k in others]
     block = _with_chips_of(made, of_others)
     tracks = independent_tracks([scene.image.read(_whole(scene)) for scene in scenes])
-    ground, seen = _ties(tracks, sources, made.adjustment.models, shown)
+    ground, seen = ties_of(tracks, sources, made.adjustment.models, shown)
     models = dict(zip(sources, made.adjustment.models, strict=True))
     model = models.get(shown, scenes[shown].model)
-    line_sample, fitting, offset, noise_px = _smoothed(model, ground, seen)
+    line_sample, fitting, offset, noise_px = smoothed_ties(model, ground, seen)
     return RealView(
         scenes[shown],
         place.crop,
-        _rpc(scenes[others[0]].model),
+        rpc_of(scenes[others[0]].model),
         block,
         ground[fitting],
         line_sample[fitting],
-        _moved(model.project(block.points.lon_lat_h), offset),
+        moved_by(model.project(block.points.lon_lat_h), offset),
         noise_px,
     )
 
@@ -130,13 +130,13 @@ def _whole(scene: Scene) -> Window:
     return Window(0, 0, *scene.image.shape)
 
 
-def _rpc(model: SensorModel) -> RpcModel:
+def rpc_of(model: SensorModel) -> RpcModel:
     if not isinstance(model, RpcModel):
         raise TypeError(f"a view with an RPC expected, {type(model).__name__} given")
     return model
 
 
-def _ties(
+def ties_of(
     tracks: Observations, sources: list[int], models: Sequence[SensorModel], shown: int
 ) -> tuple[Array, Array]:
     """Ground (t, 3) where the rays of the sources meet, and where (t, 2) the image shown shows it."""
@@ -147,7 +147,9 @@ def _ties(
     return ground, tracks.line_sample[tracks.image == shown]
 
 
-def _smoothed(model: SensorModel, ground: Array, seen: Array) -> tuple[Array, BoolArray, Array, float]:
+def smoothed_ties(
+    model: SensorModel, ground: Array, seen: Array
+) -> tuple[Array, BoolArray, Array, float]:
     """Where an image shows ground: its model, an affine that fits the ties, and medians of neighbours.
 
     Returns:
@@ -164,9 +166,10 @@ def _smoothed(model: SensorModel, ground: Array, seen: Array) -> tuple[Array, Bo
         rest = misfit - design @ offset
         far = np.linalg.norm(rest, axis=1)
         fitting = far < _BLUNDER * np.median(far[fitting])
-    places = _moved(modelled, offset)
+    places = moved_by(modelled, offset)
     tree = KDTree(places[fitting])
-    _, near = tree.query(np.where(np.isfinite(places), places, 0.0), _NEIGHBOURS)
+    neighbours = min(_NEIGHBOURS, int(fitting.sum()))
+    _, near = tree.query(np.where(np.isfinite(places), places, 0.0), neighbours)
     places += np.median(rest[fitting][near], axis=1)
     noise_px = float(np.median(np.linalg.norm((seen - places)[fitting], axis=1)))
     return places, fitting, offset, noise_px
@@ -176,7 +179,7 @@ def _design(line_sample: Array) -> Array:
     return np.column_stack([np.ones(len(line_sample)), line_sample / 1000.0])
 
 
-def _moved(line_sample: Array, offset: Array) -> Array:
+def moved_by(line_sample: Array, offset: Array) -> Array:
     return np.asarray(line_sample + _design(line_sample) @ offset)
 
 

@@ -265,6 +265,8 @@ def _notes(report: dict[str, Any]) -> dict[str, Any]:
     return {
         "statements": report["run"].get("statements", []),
         "pixel_findings": report["scene"].get("pixel_findings", []),
+        "findings": report.get("findings", []),
+        "held_percent": report["coverage"]["percent"],
     }
 
 

@@ -79,10 +79,11 @@ def show_outcomes(outcomes: list[Outcome], *, as_json: bool) -> None:
 
 
 def _show_findings(outcomes: list[Outcome]) -> None:
-    """Print on standard error what is wrong with the pixels of scenes."""
+    """Print on standard error what was found in pixels, and what no correction follows."""
     for outcome in outcomes:
-        for finding in outcome.get("pixel_findings", []):
-            typer.echo(f"amers: {printable(str(outcome['scene']))}: {finding['words']}", err=True)
+        found = [*outcome.get("pixel_findings", []), *outcome.get("findings", [])]
+        for words in dict.fromkeys(finding["words"] for finding in found):
+            typer.echo(f"amers: {printable(str(outcome['scene']))}: {words}", err=True)
 
 
 def write_overview(outcomes: list[Outcome], folder: Path) -> None:
@@ -120,7 +121,16 @@ def _verdict_rows(outcome: Outcome) -> dict[str, Any]:
 
 def _other_rows(outcome: Outcome, names: tuple[str, ...]) -> dict[str, Any]:
     """The other figures of an outcome, for people."""
-    shown = {"scene", "verdict", "verdict_scope", "statements", "pixel_findings", "marks", *_STATED}
+    shown = {
+        "scene",
+        "verdict",
+        "verdict_scope",
+        "statements",
+        "pixel_findings",
+        "findings",
+        "marks",
+        *_STATED,
+    }
     return {name: _rounded(outcome.get(name)) for name in names if name not in shown}
 
 

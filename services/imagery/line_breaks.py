@@ -11,6 +11,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.special import bdtrc
 
+from amers.services.imagery.pixel_checks import Fault
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ImageSource, Window
 from amers.services.sensors.ortho import OrthoModel
@@ -39,6 +40,8 @@ _LEAST_UNSHARED = 0.15
 """The same of what a line does not share with the one before, whatever its gain and offset."""
 _LEAST_VARIANCE = 1e-9
 """Of a line that has one grey value."""
+_SAME = 2
+"""Lines within which two signs are of one break."""
 _MOST = 8
 """An image with more is one of bad lines."""
 _LEAST_DIFFERENCE = 1e-3
@@ -46,10 +49,20 @@ _LEAST_DIFFERENCE = 1e-3
 
 
 def scene_breaks(scene: Scene) -> IntArray:
-    """The line breaks of a scene; none in an ortho-image, which was not scanned line by line."""
+    """The line breaks of a scene; none in an ortho-image, which was not scanned line by line.
+
+    Lines that its pixels repeat or lack make breaks as well.
+    """
     if isinstance(scene.model, OrthoModel):
         return np.zeros(0, dtype=np.int64)
-    return line_breaks(scene.image)
+    told = [
+        one.line + (1 if one.kind == Fault.LOST_LINES else 0)
+        for one in scene.pixel_findings or ()
+        if one.kind in (Fault.LOST_LINES, Fault.REPEATED_LINES)
+    ]
+    breaks = np.sort(np.concatenate([line_breaks(scene.image), np.array(told, dtype=np.int64)]))
+    apart = np.diff(breaks, prepend=-2 * _SAME) > _SAME
+    return breaks[apart] if apart.sum() <= _MOST else breaks[:0]
 
 
 def format_breaks(breaks: IntArray) -> str:

@@ -1,11 +1,12 @@
 """A scene: an image, its model and its acquisition, the input of registration and production."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import ConvexHull
 
 from amers.services.geodesy import ecef_from_east_north_up
+from amers.services.imagery.pixel_checks import PixelFinding, pixel_findings
 from amers.services.imagery.source import ImageSource, image_gsd_m
 from amers.services.sensors.base import SensorModel
 from amers.services.sensors.parameter_sets import ParameterSet
@@ -29,6 +30,7 @@ class Scene:
         parameter_set: what is free in its rigorous model where scenes are registered together; None for
             a correction in the image.
         statements: of its files.
+        pixel_findings: what is wrong with its pixels; None before they were measured.
     """
 
     image: ImageSource
@@ -37,6 +39,14 @@ class Scene:
     sigma_m: float
     parameter_set: ParameterSet | None = None
     statements: Statements = ()
+    pixel_findings: tuple[PixelFinding, ...] | None = None
+
+
+def with_pixel_findings(scene: Scene) -> Scene:
+    """A scene whose pixels were measured: by `read_scene`'s caller with its bands, or here without."""
+    if scene.pixel_findings is not None:
+        return scene
+    return replace(scene, pixel_findings=pixel_findings(scene.image).findings)
 
 
 def scene_centre(scene: Scene) -> Array:

@@ -9,7 +9,7 @@ from amers.services.imagery.scene import Scene
 from amers.services.matching.control_points import PointMatches
 from amers.services.misfit.control_observations import ControlObservations
 from amers.services.misfit.scene_adjustment import SceneAdjustment
-from amers.services.quality.lack_of_fit import Elsewhere
+from amers.services.quality.points_elsewhere import Elsewhere
 from amers.services.registration.context import SearchStage
 from amers.services.registration.options import RegistrationOptions
 from amers.services.registration.search import Search, control_observations

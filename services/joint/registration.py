@@ -10,7 +10,7 @@ import numpy as np
 from amers.services.adjustment.known_images import KnownImages
 from amers.services.errors import ComputationError, CoverageError, DoesNotFit
 from amers.services.imagery.line_breaks import scene_breaks
-from amers.services.imagery.scene import Scene
+from amers.services.imagery.scene import Scene, with_pixel_findings
 from amers.services.imagery.source import CachedImage, image_gsds_m
 from amers.services.joint.block import JointBlock, repeated
 from amers.services.joint.fitting import Left, SceneFit, adjust_fitting, scene_fit, ties_between
@@ -196,6 +196,7 @@ def measure_scene(
 ) -> MeasuredScene:
     """A scene with its control points, found as those of a scene alone; with none where that fails."""
     options = options_in_block(options)
+    scene = with_pixel_findings(scene)
     stages: list[SearchStage] = []
     try:
         context, search, alone = search_scene(scene, points, chips, options, stages=stages)

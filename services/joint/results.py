@@ -22,6 +22,7 @@ from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.misfit.shared_errors import SharedErrors
 from amers.services.misfit.short_motion import STILL
 from amers.services.quality.cell_stability import cell_stability_of, cells_of
+from amers.services.quality.findings import with_findings
 from amers.services.quality.frames import shared_frame, weighted_frame
 from amers.services.quality.qualification import QualificationOptions, qualify_repeated
 from amers.services.quality.stability import AdjustedScene, Repetition, stability_of
@@ -183,7 +184,7 @@ def registered_scene(
     measured = block.scenes[number]
     adjustment = _with_structures(block, number, scene_adjustment(block, number, options))
     measures = point_results(measured.scene, measured.points, measured.search, adjustment)
-    scene = _adjusted_scene(block, number, measures, adjustment)
+    scene = with_findings(_adjusted_scene(block, number, measures, adjustment))
 
     def of_scene(
         repetitions: Sequence[tuple[Sequence[IntArray], JointBlock | None]],
@@ -204,7 +205,7 @@ def registered_scene(
     views = measured.search.matches.view_measures
     return Registration(
         scene.model,
-        adjustment,
+        scene.adjustment,
         measures,
         replace(views, point=measured.search.rows[views.point]),
         measured.stages,
@@ -235,7 +236,15 @@ def _adjusted_scene(
         control_gsd_m=measured.search.chip_side_m / CHIP_SIZE,
         breaks=measured.search.breaks,
         shears=shears_of_active(measured.scene, measured.search, measures.active),
+        pixel_findings=measured.scene.pixel_findings or (),
+        tie_places=_tie_places(block, number),
     )
+
+
+def _tie_places(block: JointBlock, number: int) -> Array:
+    """Line and sample (k, 2) of the active tie points of a scene."""
+    rows = block.of_ties(number)
+    return block.ties.line_sample[rows[block.adjustment.active[rows]]]
 
 
 def _held_by_ties(options: QualificationOptions) -> QualificationOptions:

@@ -57,7 +57,9 @@ class AccuracyStatement:
         return tuple(f"{label}: {words}" for label, words in self.words.items())
 
 
-def scene_accuracy(relative_m: float, on_the_earth_m: float, frame: Frame) -> AccuracyStatement:
+def scene_accuracy(
+    relative_m: float, on_the_earth_m: float, frame: Frame, held_percent: float
+) -> AccuracyStatement:
     """The statement for a registered scene.
 
     CE90 is that of the ground where the model puts a pixel, when the true height of the ground is known.
@@ -65,21 +67,31 @@ def scene_accuracy(relative_m: float, on_the_earth_m: float, frame: Frame) -> Ac
     error of the frame in any case: its LE90 is stated on the Earth.
 
     Args:
-        relative_m: CE90 at the worst place of the image, relative to the control points.
+        relative_m: CE90 at the worst place that points hold, relative to the control points.
         on_the_earth_m: the same with the frame of the control points; NaN when unknown.
         frame: of the control points.
+        held_percent: share of the image that points hold.
     """
     le90_m = frame_le90_m(frame)
     height = f"LE90 of the control points' frame {_metres(le90_m)}"
+    place = f"(worst place of the {_percent(held_percent)} of the image that points hold)"
+    if held_percent == 100.0:
+        place = "(worst place of the image)"
     return AccuracyStatement(
-        StatedAccuracy(RELATIVE, relative_m, np.nan, f"CE90 {_metres(relative_m)} ({_WORST_PLACE})"),
+        StatedAccuracy(RELATIVE, relative_m, np.nan, f"CE90 {_metres(relative_m)} {place}"),
         StatedAccuracy(
             ON_THE_EARTH,
             on_the_earth_m,
             le90_m,
-            _with_reason(f"CE90 {_metres(on_the_earth_m)} ({_WORST_PLACE}), {height}", frame),
+            _with_reason(f"CE90 {_metres(on_the_earth_m)} {place}, {height}", frame),
         ),
     )
+
+
+def _percent(share: float) -> str:
+    """A share in whole percent: all of it is 100, and nothing 0, without rounding."""
+    whole = round(share) if share in (0.0, 100.0) else min(max(round(share), 1), 99)
+    return f"{whole} %"
 
 
 def points_accuracy(covariance_m2: Array, frame: Frame, of: str) -> AccuracyStatement:

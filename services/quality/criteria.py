@@ -61,10 +61,12 @@ _DESCRIPTIONS = {
         "Active points", "", 0, "Number of points that the final adjustment uses."
     ),
     "coverage_percent": _Description(
-        "Coverage of the image",
+        "Area that points hold",
         "%",
         0,
-        "Share of the cells of the image that contain an active point.",
+        "Share of the image for which the accuracy is stated: an active point lies within a reach, the "
+        "distance in which a typical point has four others (at most 15 % of a side), and no more points "
+        "there agree on another place.",
     ),
     "active_of_matched": _Description(
         "Active / matched", "", 2, "Active points divided by matched points."
@@ -106,111 +108,6 @@ _DESCRIPTIONS = {
         2,
         "Square root of the weighted sum of squares of the active residuals over the degrees of "
         "freedom; 1 when the stated sigmas are true.",
-    ),
-    "second_consensus_share": _Description(
-        "Second consensus / active",
-        "",
-        2,
-        "Largest group of deactivated points that agree on another displacement, beyond the predicted "
-        "CE90, divided by the active points.",
-    ),
-    "structure_along_lines": _Description(
-        "Residuals along the lines",
-        "px",
-        2,
-        "Largest displacement of an oscillation or bend along the lines in the residuals; 0 if it could "
-        "be chance (F test, corrected for the number of shapes, p > 0.0001). The limit is a tenth of "
-        "the predicted CE90.",
-    ),
-    "steps_along_lines": _Description(
-        "Steps along the lines",
-        "px",
-        2,
-        "Largest step of the residuals at a line; 0 if it could be chance. The limit is a tenth of the "
-        "predicted CE90.",
-    ),
-    "structure_along_samples": _Description(
-        "Residuals along the samples",
-        "px",
-        2,
-        "Largest displacement of an oscillation or bend along the samples in the residuals; 0 if it "
-        "could be chance. Possible causes: seams between detectors, distortions of the optics. The "
-        "limit is half of the predicted CE90 for good, twice it for usable.",
-    ),
-    "steps_along_samples": _Description(
-        "Steps along the samples",
-        "px",
-        2,
-        "Largest step of the residuals at a sample, such as a seam between two detectors; 0 if it could "
-        "be chance. Limits as for residuals along the samples.",
-    ),
-    "structure_in_image": _Description(
-        "Residuals over the image",
-        "px",
-        2,
-        "Largest displacement of a wave in two dimensions in the residuals; 0 if it could be chance. "
-        "Limits as for residuals along the samples.",
-    ),
-    "structure_against_height": _Description(
-        "Residuals against height",
-        "px",
-        2,
-        "Largest displacement that grows with the height of the points; 0 if it could be chance. It "
-        "appears where the lines of sight of the model differ from those of the image.",
-    ),
-    "correction_against_height": _Description(
-        "Correction up the slope of the ground",
-        "%",
-        2,
-        "A plane is fitted to the displacements of the points from the model before registration, and "
-        "one to their heights. Growth of the displacement up the slope of the ground, minus two "
-        "standard deviations, in percent of the distance. 0 if it grows as much across the slope, or if "
-        "no other view of the place explains it.",
-    ),
-    "line_of_sight": _Description(
-        "Line of sight",
-        "deg",
-        1,
-        "On slopes, chips are sheared against the scene when both see the ground from different "
-        "directions. Angle between the line of sight that the shears of all chips imply and that of the "
-        "model; 0 if it could be chance (p > 0.00001).",
-    ),
-    "structure_within_chips": _Description(
-        "Motion within the chips",
-        "px",
-        2,
-        "Largest displacement of an oscillation that is shorter than a chip: parts of different chips "
-        "at the same lines are displaced by the same amount (F test, as along the lines). The limit of "
-        "good is half of the predicted CE90, which includes this displacement.",
-    ),
-    "lines_behind_breaks": _Description(
-        "Lines behind breaks of the image",
-        "%",
-        0,
-        "Where lines are missing or repeated, neighbouring lines differ more over the width of the "
-        "image than elsewhere: 1.4 times or more (0.0001 such places expected by chance). Share of the "
-        "lines that lie in parts, between these breaks, with fewer than three active points.",
-    ),
-    "missed_along_lines": _Description(
-        "Lines whose points do not agree",
-        "%",
-        0,
-        "Share of the lines that lie in intervals where almost no point agrees with the scene, fewer "
-        "than chance explains (binomial test, corrected for the number of intervals, p < 0.01). Points "
-        "under clouds and on missing pixels do not count. Usable up to 10 %.",
-    ),
-    "missed_along_samples": _Description(
-        "Samples whose points do not agree",
-        "%",
-        0,
-        "The same for samples. Possible cause: a detector out of place. Usable up to 10 %.",
-    ),
-    "points_elsewhere": _Description(
-        "Points that agree elsewhere",
-        "",
-        0,
-        "Points that were not found at their expected places are searched again in a wide window. "
-        "Number of these points that agree on another displacement, more than chance explains.",
     ),
     "marks_in_doubt": _Description(
         "Marks in doubt",

@@ -6,12 +6,11 @@ scene. Residuals against height need heights that differ by more than their erro
 level ground.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from amers.services.matching.chip_shears import ChipShears
-from amers.services.quality.criteria import Criterion, at_most
 from amers.services.types import Array, BoolArray, IntArray
 
 _UNKNOWNS = 6
@@ -37,10 +36,8 @@ _LARGEST_SIGMA_DEG, _LARGEST_LEAN = 3.0, 1.5
 """Of a direction that is told: its largest standard deviation, and the tangent of the largest angle from
 the vertical at which images are taken. Where slopes hardly rise above the noise, what views share of it
 draws the direction aside."""
-_MAX_CHANCE = 1e-5
+MOST_CHANCE = 1e-5
 """A direction beside that of the model that chance explains with a larger probability is none."""
-_LARGEST_DEG = 5.0
-"""Largest angle between the lines of sight of a usable model and its image."""
 
 
 @dataclass(frozen=True)
@@ -216,18 +213,3 @@ class _Linearised:
 
 def _loss(misfit: Array, scale: float) -> float:
     return float(np.log1p(misfit / (_DEGREES_OF_FREEDOM * scale)).sum())
-
-
-def line_of_sight_criterion(sight: ImpliedSight | None) -> Criterion:
-    """The criterion on the angle between the line of sight of the model and the one that chips imply."""
-    name = "line_of_sight"
-    if sight is None or sight.chance > _MAX_CHANCE:
-        return at_most(name, 0.0, _LARGEST_DEG, "usable")
-    criterion = at_most(name, sight.angle_deg, _LARGEST_DEG, "usable")
-    seen = (
-        f"the chips of {sight.points} points are sheared on slopes as if seen {sight.angle_deg:.0f} "
-        f"degrees (standard deviation {sight.sigma_deg:.0f}) from the lines of sight of the model "
-        f"(p = {sight.chance:.1g}). Possible causes: the model of the scene belongs to another view, or "
-        "a model of the images that the chips come from does"
-    )
-    return replace(criterion, note="" if criterion.met else seen)

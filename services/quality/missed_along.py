@@ -15,7 +15,6 @@ UNFOUND = ("low_score", "ambiguous", "border_peak", "views_disagree")
 _MAX_CHANCE = 0.01
 _MOST_GAPS = 3
 _FEWEST = 4
-_BORDERS, _FEWEST_AT_BORDER = 4, 3
 _MOST_ENDS = 400
 """Points at which intervals begin, and at which they end: dense references have thousands."""
 _SAME, _FEWEST_IN_ROW = 0.0005, 4
@@ -47,42 +46,6 @@ def missed_along(position: Array, agrees: BoolArray, tried: BoolArray) -> BoolAr
         if not len(of_interval):
             break
         missed[rows[of_interval]] = True
-    return missed
-
-
-def missed_at_borders(
-    position: Array, agrees: BoolArray, found: BoolArray, misfit_px: Array
-) -> BoolArray:
-    """Points (n,) between a border and the first that agrees, where chance leaves out fewer.
-
-    The last part of an image that was put together, or that oscillates, has no points on its other side.
-    Points that are left out there form no gap, and the correction is extrapolated beyond the others. The
-    chance that the points of a border are all among those left out is that of drawing them without
-    return, times the four borders of an image, at most 0.01. They are displaced alike: false matches are
-    not.
-
-    Args:
-        position: (n,) line or sample where the points are expected.
-        agrees: (n,) with the scene.
-        found: (n,) those that the scene shows somewhere.
-        misfit_px: (n, 2) from where the scene places the points to where they were found.
-    """
-    missed = np.zeros(len(position), dtype=bool)
-    rows = np.flatnonzero(found)
-    rows = rows[np.argsort(position[rows], kind="stable")]
-    left_out = ~agrees[rows]
-    if left_out.all():
-        return missed
-    n, n_left_out = len(rows), int(left_out.sum())
-    for ordered in (rows, rows[::-1]):
-        run = int(np.argmax(agrees[ordered]))
-        drawn = np.arange(run)
-        chance = _BORDERS * float(np.prod((n_left_out - drawn) / (n - drawn)))
-        if run < _FEWEST_AT_BORDER or chance > _MAX_CHANCE:
-            continue
-        together = misfit_px[ordered[:run]].mean(axis=0)
-        if np.hypot(*(misfit_px[ordered[:run]] - together).T).max() < np.hypot(*together):
-            missed[ordered[:run]] = True
     return missed
 
 

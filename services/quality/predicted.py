@@ -18,13 +18,15 @@ class PredictedAccuracy:
     frame of the control points, an error that all of them share. Metres are on the ground, at its true
     height.
 
+    Places that no point holds have predictions, too, but are not counted: see `HeldArea`.
+
     Attributes:
         std_line_px, std_sample_px: (g, g) on a regular grid from corner to corner, relative to the
             control points.
         ce90_px: (g, g) relative to the control points.
-        worst_px: the largest of `ce90_px`.
-        overall_px: CE90 of all places alike, the radius that holds 90 % of their errors: what CE90 of
-            check points all over the image estimates.
+        worst_px: the largest of all places that points hold; NaN where they hold none.
+        overall_px: CE90 of all these places alike, the radius that holds 90 % of their errors: what CE90
+            of check points all over them estimates.
         worst_m, overall_m: the same on the ground, relative to the control points.
         on_the_earth_worst_m, on_the_earth_overall_m: the same with the frame; NaN when unknown.
     """
@@ -50,27 +52,26 @@ def predict_accuracy(scene: AdjustedScene, grid: int) -> PredictedAccuracy:
     line, sample = np.meshgrid(
         *(np.linspace(0.0, size - 1.0, grid) for size in scene.shape), indexing="ij"
     )
-    line_sample = np.column_stack([line.ravel(), sample.ravel()])
-    covariance = scene.adjustment.covariance_at(line_sample)
+    nodes = np.column_stack([line.ravel(), sample.ravel()])
+    covariance = scene.adjustment.covariance_at(nodes)
     std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).reshape(grid, grid, 2)
-    ce90_px = normal_ce90(covariance)
-    derivative = _derivative(scene, line_sample)
+    held = nodes if scene.held is None else scene.held.places
+    ce90_px = normal_ce90(covariance).reshape(grid, grid)
+    figures = _over(scene, held) if len(held) else [float("nan")] * 6
+    return PredictedAccuracy(std[..., 0], std[..., 1], ce90_px, *figures)
+
+
+def _over(scene: AdjustedScene, places: Array) -> list[float]:
+    """Worst and overall CE90 at places (n, 2): pixels, on the ground, on the Earth."""
+    covariance = scene.adjustment.covariance_at(places)
+    derivative = _derivative(scene, places)
     to_ground = np.linalg.inv(derivative[:, :, :2])
     of_frame = frame_in_image(scene.frame, derivative, scene.adjustment.apart_px)
-    relative_m2, on_the_earth_m2 = (
+    on_ground = (
         to_ground @ part @ to_ground.transpose(0, 2, 1) for part in (covariance, covariance + of_frame)
     )
-    return PredictedAccuracy(
-        std_line_px=std[..., 0],
-        std_sample_px=std[..., 1],
-        ce90_px=ce90_px.reshape(grid, grid),
-        worst_px=float(ce90_px.max()),
-        overall_px=overall_ce90(covariance),
-        worst_m=float(normal_ce90(relative_m2).max()),
-        overall_m=overall_ce90(relative_m2),
-        on_the_earth_worst_m=float(normal_ce90(on_the_earth_m2).max()),
-        on_the_earth_overall_m=overall_ce90(on_the_earth_m2),
-    )
+    parts = (covariance, *on_ground)
+    return [figure for part in parts for figure in (float(normal_ce90(part).max()), overall_ce90(part))]
 
 
 def _derivative(scene: AdjustedScene, line_sample: Array) -> Array:

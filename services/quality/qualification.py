@@ -3,25 +3,17 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+import shapely
 from scipy.spatial import KDTree
 
-from amers.services.conventions import CHIP_SIZE
-from amers.services.matching.consensus import a_contrario_consensus, consensus_tolerance_px
-from amers.services.misfit.broken_image import on_one_side
 from amers.services.quality.accuracy import Statistics, statistics
 from amers.services.quality.accuracy_statement import AccuracyStatement, scene_accuracy
 from amers.services.quality.cell_stability import CellStability, measure_cell_stability
 from amers.services.quality.criteria import Criterion, Verdict, at_least, at_most, verdict_of
+from amers.services.quality.finding import Finding
+from amers.services.quality.findings import with_findings
 from amers.services.quality.frames import why_unknown
-from amers.services.quality.lack_of_fit import (
-    against_height,
-    breaks_criterion,
-    correction_against_height,
-    elsewhere_criterion,
-    missed_criterion,
-    structure_criteria,
-)
-from amers.services.quality.line_of_sight import implied_sight, line_of_sight_criterion
+from amers.services.quality.held_area import HeldArea
 from amers.services.quality.predicted import PredictedAccuracy, predict_accuracy
 from amers.services.quality.stability import (
     AdjustedScene,
@@ -52,7 +44,7 @@ class QualificationOptions:
     Attributes:
         good_active_points: smallest number of active points (SRP: one measure is never enough, at least
             20).
-        good_coverage_percent: smallest coverage of the image by active points.
+        good_coverage_percent: smallest share of the image that points hold, see `HeldArea`.
         good_active_of_matched: smallest ratio of active to matched points.
         good_residual_std_px, usable_residual_std_px: largest standard deviation of the active residuals,
             of the worse coordinate, without the part that chance and the accuracy of the points explain:
@@ -67,13 +59,11 @@ class QualificationOptions:
         max_ce90_on_earth_m: largest CE90 on the Earth, with the frame of the control points, of a usable
             registration; None sets no limit.
         good_unit_weight: largest standard deviation of unit weight: residuals over the stated sigmas.
-        good_second_consensus_share: largest group of deactivated points that agree on another
-            displacement, as a share of the active points. A scene has one displacement, not two.
         usable_active_points: smallest number of active points.
         usable_active_of_few: smallest ratio of active to matched points where fewer points are active
             than a good registration has, or where they scatter by more than one allows: part of a few
             points, and of points that hardly agree, agree on a wrong correction too.
-        coverage_cells: cells of the coverage along each side of the image.
+        coverage_cells: cells along each side of the image in which points are counted.
         grid: nodes of the predicted accuracy along each side of the image.
         draws: number of repeated adjustments in the stability test.
         kept_share: share of the active points in each draw.
@@ -89,7 +79,6 @@ class QualificationOptions:
     good_ce90_m: float = 0.75
     max_ce90_on_earth_m: float | None = None
     good_unit_weight: float = 3.0
-    good_second_consensus_share: float = 0.3
     usable_active_points: int = 6
     usable_active_of_few: float = 0.75
     usable_residual_std_px: float = 2.0
@@ -139,21 +128,25 @@ class GroundResiduals:
 
 @dataclass(frozen=True)
 class Coverage:
-    """Share of equal cells of the image that hold an active point.
-
-    Cells show the edge that is extrapolated and the hole that no point checks; a convex hull of a few
-    far points hides an empty middle. With five by five cells, 60 % are 15 of 25 cells: 20 well-spread
-    points reach that easily, 20 points at random places reach 56 % on average.
+    """The part of the image that active points hold, see `HeldArea`: accuracy is stated for it.
 
     Attributes:
-        cells: (c, c) active points in each cell, rows from the first line down.
-        occupied: cells with a point.
-        percent: 0 to 100.
+        cells: (c, c) active points in equal cells of the image, rows from the first line down.
+        percent: of the image that is held, 0 to 100.
+        reach_px: of a point.
+        outline: rings of the area that is held, (n, 2) line and sample each, closed; holes follow the
+            rings that surround them.
     """
 
     cells: Array
-    occupied: int
     percent: float
+    reach_px: float
+    outline: tuple[Array, ...]
+
+    def holds(self, line_sample: Array) -> BoolArray:
+        """Which places (n, 2) of the image are held."""
+        inside = [shapely.contains_xy(shapely.Polygon(ring), line_sample) for ring in self.outline]
+        return np.asarray(np.sum(inside, axis=0) % 2 == 1) & np.ones(len(line_sample), dtype=bool)
 
 
 @dataclass(frozen=True)
@@ -170,6 +163,7 @@ class Qualification:
         predicted: accuracy by the covariance of the correction.
         accuracy: as every place states it.
         coverage: of the image by active points.
+        findings: what the correction does not follow, most harmful first; the accuracy includes them.
     """
 
     verdict: Verdict
@@ -182,6 +176,7 @@ class Qualification:
     predicted: PredictedAccuracy
     accuracy: AccuracyStatement
     coverage: Coverage
+    findings: tuple[Finding, ...] = ()
 
 
 def qualify(
@@ -194,6 +189,8 @@ def qualify(
         options: thresholds and sampling.
         rng: draws the points that are held out.
     """
+    if scene.held is None:
+        scene = with_findings(scene)
     stability = measure_stability(scene, options.draws, options.kept_share, rng)
     return qualify_repeated(scene, options, stability, measure_cell_stability(scene))
 
@@ -216,7 +213,9 @@ def qualify_repeated(
         tie_residual_px: standard deviation of the residuals of tie points, of the worse coordinate; it
             stands in where fewer active points than a usable registration needs have residuals.
     """
-    measures, adjustment, shape = scene.measures, scene.adjustment, scene.shape
+    if scene.held is None:
+        scene = with_findings(scene)
+    measures, adjustment = scene.measures, scene.adjustment
     point_counts = count_points(measures)
     residuals = residuals_in_image(measures.residual_px[measures.active])
     worse = _times_worse(adjustment.sigma0)
@@ -226,8 +225,8 @@ def qualify_repeated(
     if point_counts.active < _ENOUGH_RESIDUALS and np.isfinite(tie_residual_px):
         residual_std_px = shown_residual_std_px = tie_residual_px
     predicted = predict_accuracy(scene, options.grid)
-    stated_px = float(np.median(predicted.ce90_px))
-    coverage = image_coverage(measures.line_sample[measures.active], shape, options.coverage_cells)
+    assert scene.held is not None
+    coverage = image_coverage(measures.line_sample[measures.active], scene.held, options.coverage_cells)
     figures = _Figures(
         active_points=point_counts.active,
         active_of_matched=point_counts.active_of_matched,
@@ -237,13 +236,9 @@ def qualify_repeated(
         displacement_px=max((place.median_px for place in stability.displacements), default=np.nan),
         predicted_ce90_px=predicted.worst_px,
         unit_weight=adjustment.sigma0,
-        second_consensus_share=second_consensus_share(measures, stated_px),
     )
     control_px = max(scene.control_gsd_m / scene.gsd_m, 1.0)
-    criteria = (
-        *_criteria(figures, options, scene.gsd_m, control_px),
-        *_of_fit(scene, stated_px),
-    )
+    criteria = _criteria(figures, options, scene.gsd_m, control_px)
     if options.max_ce90_on_earth_m is not None:
         criteria += (_on_earth(predicted, options.max_ce90_on_earth_m, scene.frame),)
     return Qualification(
@@ -255,8 +250,11 @@ def qualify_repeated(
         stability=stability,
         cell_stability=cell_stability,
         predicted=predicted,
-        accuracy=scene_accuracy(predicted.worst_m, predicted.on_the_earth_worst_m, scene.frame),
+        accuracy=scene_accuracy(
+            predicted.worst_m, predicted.on_the_earth_worst_m, scene.frame, coverage.percent
+        ),
         coverage=coverage,
+        findings=scene.findings,
     )
 
 
@@ -298,39 +296,17 @@ def unexplained_px(measures: Measures, point_sigma_px: Array) -> float:
     return float(np.sqrt(np.maximum(residual.var(axis=0, ddof=1) - explained, 0.0).max()))
 
 
-def second_consensus_share(measures: Measures, stated_px: float) -> float:
-    """Largest group of deactivated points that agree on another displacement, over the active points.
-
-    Points agree when their residuals are as near to each other as those of the active points are to
-    zero. A displacement that is no larger than the accuracy of the scene is no other one.
-
-    Args:
-        measures: of all points.
-        stated_px: CE90 of the scene.
-    """
-    active = measures.residual_px[measures.active]
-    if len(active) == 0:
-        return float("nan")
-    deactivated = measures.residual_px[measures.matched & ~measures.active]
-    deactivated = deactivated[~(np.hypot(*deactivated.T) <= stated_px)]
-    tolerance_px = consensus_tolerance_px(float(np.sqrt((active**2).mean())))
-    largest_px = float(np.abs(deactivated).max(initial=tolerance_px))
-    second = a_contrario_consensus(deactivated, tolerance_px, largest_px)
-    return int(second.inliers.sum()) / len(active)
-
-
 def _residuals_on_ground(residual_m: Array) -> GroundResiduals:
     """Statistics of residuals (n, 2), east and north."""
     east, north = residual_m[:, 0], residual_m[:, 1]
     return GroundResiduals(statistics(east), statistics(north), statistics(np.hypot(east, north)))
 
 
-def image_coverage(line_sample: Array, shape: tuple[int, int], cells: int) -> Coverage:
-    """Numbers of active points (n, 2) in `cells` x `cells` equal parts of the image."""
-    edges = [np.linspace(-0.5, size - 0.5, cells + 1) for size in shape]
+def image_coverage(line_sample: Array, held: HeldArea, cells: int) -> Coverage:
+    """The area that points hold, and numbers of active points (n, 2) in `cells` x `cells` parts."""
+    edges = [np.linspace(-0.5, size - 0.5, cells + 1) for size in held.shape]
     counts, _, _ = np.histogram2d(line_sample[:, 0], line_sample[:, 1], bins=edges)
-    occupied = int(np.count_nonzero(counts))
-    return Coverage(counts, occupied, 100.0 * occupied / cells**2)
+    return Coverage(counts, held.percent, held.reach_px, held.rings)
 
 
 @dataclass(frozen=True)
@@ -345,89 +321,6 @@ class _Figures:
     displacement_px: float
     predicted_ce90_px: float
     unit_weight: float
-    second_consensus_share: float
-
-
-def _of_fit(scene: AdjustedScene, predicted_px: float) -> list[Criterion]:
-    """The criteria on what the residuals depend on, and on points that agree elsewhere."""
-    measures = scene.measures
-    sight = np.zeros(2)
-    if len(measures.lon_lat_h):
-        sight = scene.model.project_derivative(measures.lon_lat_h)[:, :, 2].mean(axis=0)
-    expected = scene.model.project(measures.lon_lat_h)
-    structures = structure_criteria(scene.adjustment.structures, sight, scene.shape, predicted_px)
-    displaced = against_height(scene.elsewhere, sight, predicted_px)
-    if displaced is not None:
-        structures = [displaced if one.name == displaced.name else one for one in structures]
-    # A point that lies within the stated accuracy says nothing against it, however well others agree.
-    misfit_px = measures.line_sample - expected
-    off = ~(np.hypot(*misfit_px.T) <= predicted_px)
-    return [
-        *structures,
-        _against_slope(scene),
-        *_line_of_sight(scene),
-        *_behind_breaks(scene),
-        missed_criterion(
-            "lines",
-            expected[:, 0],
-            measures.active,
-            measures.reason,
-            scene.shape[0],
-            misfit_px=misfit_px,
-            counts=off & _whole(scene, expected),
-        ),
-        missed_criterion(
-            "samples",
-            expected[:, 1],
-            measures.active,
-            measures.reason,
-            scene.shape[1],
-            misfit_px=misfit_px,
-            counts=off,
-        ),
-        elsewhere_criterion(scene.elsewhere, expected, measures.active, scene.shape),
-    ]
-
-
-def _against_slope(scene: AdjustedScene) -> Criterion:
-    """The criterion on a correction that grows up the slope of the ground.
-
-    Steps between lines are no growth: where they are followed, the affine part beside them counts.
-    """
-    measures, adjustment = scene.measures, scene.adjustment
-    predicted = measures.predicted[measures.active]
-    measured = measures.line_sample[measures.active]
-    if any(one.is_step for one in adjustment.components):
-        affine = replace(adjustment.correction, displacement=None)
-        measured = affine.apply(predicted) + measures.residual_px[measures.active]
-    height_m = measures.lon_lat_h[measures.active, 2]
-    return correction_against_height(measured - predicted, predicted, height_m, scene.gsd_m)
-
-
-def _line_of_sight(scene: AdjustedScene) -> list[Criterion]:
-    """The criterion on the line of sight of the model, where chips show shears."""
-    if scene.shears is None:
-        return []
-    derivative = scene.model.project_derivative(scene.measures.lon_lat_h[scene.shears.point])
-    lean = np.asarray(np.linalg.solve(derivative[:, :, :2], derivative[:, :, 2:])[:, :, 0], np.float64)
-    return [line_of_sight_criterion(implied_sight(scene.shears, lean))]
-
-
-def _whole(scene: AdjustedScene, expected: Array) -> BoolArray:
-    """Points (n,) expected at places (n, 2) whose chips no break of the image cuts."""
-    if scene.breaks is None:
-        return np.ones(len(expected), dtype=bool)
-    side_px = CHIP_SIZE * scene.control_gsd_m / scene.gsd_m
-    return on_one_side(scene.breaks, expected[:, 0], side_px, 0.0)
-
-
-def _behind_breaks(scene: AdjustedScene) -> list[Criterion]:
-    """The criterion on breaks of the image, where it has any."""
-    if scene.breaks is None or not len(scene.breaks):
-        return []
-    line, active = scene.measures.line_sample[:, 0], scene.measures.active
-    followed = any(one.kind == "break" for one in scene.adjustment.components)
-    return [breaks_criterion(scene.breaks, line[active], followed, scene.shape[0])]
 
 
 def _on_earth(predicted: PredictedAccuracy, limit_m: float, frame: Frame) -> Criterion:
@@ -474,12 +367,6 @@ def _criteria(
         at_most("displacement_px", f.displacement_px, usable_displacement_px, "usable"),
         at_most("predicted_ce90_px", f.predicted_ce90_px, usable_ce90_px, "usable"),
         _noted(at_most("unit_weight", f.unit_weight, o.good_unit_weight, "good"), f),
-        at_most(
-            "second_consensus_share",
-            f.second_consensus_share,
-            o.good_second_consensus_share,
-            "good",
-        ),
     )
 
 

@@ -6,10 +6,13 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from amers.services.errors import ComputationError
+from amers.services.imagery.pixel_checks import PixelFinding
 from amers.services.matching.chip_shears import ChipShears
 from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.quality.accuracy import Statistics, statistics
-from amers.services.quality.lack_of_fit import Elsewhere
+from amers.services.quality.finding import Finding
+from amers.services.quality.held_area import HeldArea
+from amers.services.quality.points_elsewhere import Elsewhere
 from amers.services.sensors.base import SensorModel
 from amers.services.types import Array, BoolArray, Frame, IntArray, Measures
 
@@ -35,6 +38,10 @@ class AdjustedScene:
         breaks: first lines behind breaks of the image, where lines are missing or repeated; None where
             it was not looked for any.
         shears: of the chips of active points, with their rows among all; None where it is not known.
+        pixel_findings: what is wrong with the pixels.
+        tie_places: (k, 2) line and sample of ties with other scenes, which hold the image as well.
+        findings: what the correction does not follow; their harm is in the adjustment.
+        held: the part of the image that points hold; None before it is known.
     """
 
     model: SensorModel
@@ -48,6 +55,16 @@ class AdjustedScene:
     control_gsd_m: float = 0.0
     breaks: IntArray | None = None
     shears: ChipShears | None = None
+    pixel_findings: tuple[PixelFinding, ...] = ()
+    tie_places: Array | None = None
+    findings: tuple[Finding, ...] = ()
+    held: HeldArea | None = None
+
+    @property
+    def places(self) -> Array:
+        """Line and sample (5, 2) of the corners and the centre, each moved to where points hold."""
+        places = image_places(self.shape)
+        return places if self.held is None else self.held.nearest(places)
 
 
 Repetition = tuple[IntArray, SceneAdjustment | None]
@@ -126,7 +143,8 @@ class Stability:
         draws: number of adjustments that succeeded.
         failed_draws: number of adjustments that gave no solution.
         held_out_per_draw: number of points held out of each draw.
-        displacements: of the four corners and the centre; empty when no draw succeeded.
+        displacements: of the four corners and the centre, each at the nearest place that points hold;
+            empty when no draw succeeded.
         held_out_px: residuals of the points held out, all draws together; a point counts once for each
             draw without it.
         held_out_m: the same on the ground, by the ground sampling of the image.
@@ -226,7 +244,7 @@ def repetitions_without(scene: AdjustedScene, groups: Sequence[IntArray]) -> lis
 def what_repetitions_show(scene: AdjustedScene, repetitions: Sequence[Repetition]) -> Repeated:
     """Displacements and residuals of the points held out, of the repetitions that succeeded."""
     measures, correction = scene.measures, scene.adjustment.correction
-    places = image_places(scene.shape)
+    places = scene.places
     moved, residuals, means = [], [np.empty((0, 2))], []
     independent, stated = [], []
     for held, repeated in repetitions:

@@ -25,8 +25,8 @@ from amers.services.matching.control_points import (
 from amers.services.matching.height_consensus import height_consensus
 from amers.services.matching.predict import spread_over_image
 from amers.services.misfit.scene_adjustment import SceneAdjustment
-from amers.services.quality.lack_of_fit import Elsewhere, are_contiguous, chance_of_contiguous
 from amers.services.quality.missed_along import UNFOUND
+from amers.services.quality.points_elsewhere import Elsewhere, are_contiguous, chance_of_contiguous
 from amers.services.registration.context import PointContext, Prediction
 from amers.services.registration.search import (
     FIRST_TOLERANCE_PX,

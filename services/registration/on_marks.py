@@ -9,6 +9,8 @@ from amers.services.misfit.control_observations import ControlObservations
 from amers.services.misfit.marked_scene import MarkedScene, MarkPriors, adjust_marks
 from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.quality.criteria import at_most, verdict_of
+from amers.services.quality.findings import with_findings
+from amers.services.quality.held_area import HeldArea
 from amers.services.quality.marks import marks_report
 from amers.services.quality.qualification import Qualification, qualify
 from amers.services.quality.stability import AdjustedScene
@@ -25,9 +27,6 @@ hardly any: a shift is enough for IKONOS up to 50 km (Grodecki and Dial, 2003, B
 high-resolution satellite images described by rational polynomials, PE&RS 69)."""
 _FEWEST_REPEATED = 3
 """Marks from which parts of them are held out; with two, the one held out is nothing but the other."""
-_FEWEST_ON_SLOPES = 7
-"""Marks from which a correction that grows with the heights is told from chance: twice as many as
-parameters of a plane, and one more."""
 
 
 def register_on_marks(
@@ -70,11 +69,12 @@ def register_on_marks(
         refit,
         control_gsd_m=float(np.median(marks.sigma_m[:, :2])),
     )
+    adjusted = replace(with_findings(adjusted), held=HeldArea.whole(shape))
     qualification = _qualified(adjusted, marked, options)
     report = marks_report(adjusted, marked, marks.names, marks.sigma_m)
     return Registration(
         model,
-        adjustment,
+        adjusted.adjustment,
         adjusted.measures,
         _NO_VIEWS,
         (),
@@ -129,7 +129,6 @@ def _qualified(scene: AdjustedScene, marked: MarkedScene, options: RegistrationO
     beyond_few = {
         "displacement_px": count < _FEWEST_REPEATED,
         "residual_std_px": count < _FEWEST_REPEATED,
-        "correction_against_height": count < _FEWEST_ON_SLOPES,
     }
     criteria = [one for one in qualification.criteria if not beyond_few.get(one.name, False)]
     in_doubt = count if marked.disagree else 0

@@ -16,14 +16,15 @@ from amers.services.errors import (
     TurnedImage,
 )
 from amers.services.imagery.line_breaks import scene_breaks
-from amers.services.imagery.scene import Scene
+from amers.services.imagery.scene import Scene, with_pixel_findings
 from amers.services.imagery.source import CachedImage
 from amers.services.matching.consensus import Voters
 from amers.services.matching.control_points import ChipSearch, match_points
 from amers.services.misfit.scene_adjustment import SceneAdjustment
+from amers.services.quality.findings import with_findings
 from amers.services.quality.frames import shared_frame
-from amers.services.quality.lack_of_fit import Elsewhere
 from amers.services.quality.marks import MarksReport, marks_beside_points
+from amers.services.quality.points_elsewhere import Elsewhere
 from amers.services.quality.qualification import Qualification, qualify
 from amers.services.quality.stability import AdjustedScene
 from amers.services.registration.another_view import another_view
@@ -144,6 +145,7 @@ def register_scene(
         RescaledImage: they agree on an image with finer or coarser pixels than its model says.
         BrokenImage: too few points were found, or agree, and lines of the image were lost or repeated.
     """
+    scene = with_pixel_findings(scene)
     rescaled = cache(partial(how_it_is_rescaled, scene, points, chips, options))
     try:
         with naming_breaks(scene):
@@ -315,7 +317,7 @@ def build_registration(
 
     frame = shared_frame(points, measures.active)
     model = CorrectedModel(scene.model, adjustment.correction)
-    adjusted = AdjustedScene(
+    unjudged = AdjustedScene(
         model,
         measures,
         adjustment,
@@ -327,7 +329,9 @@ def build_registration(
         control_gsd_m=context.stages[-1].chip_gsd_m,
         breaks=context.breaks,
         shears=shears_of_active(scene, search, measures.active),
+        pixel_findings=scene.pixel_findings or (),
     )
+    adjusted = with_findings(unjudged)
     rng = np.random.default_rng(options.seed)
     qualification = qualify(adjusted, options.qualification, rng)
     view_measures = search.matches.view_measures
@@ -337,5 +341,12 @@ def build_registration(
     if marks is not None:
         report = marks_beside_points(adjusted, marks.names, marks.sigma_m)
     return Registration(
-        model, adjustment, measures, views, tuple(context.stages), frame, qualification, report
+        model,
+        adjusted.adjustment,
+        measures,
+        views,
+        tuple(context.stages),
+        frame,
+        qualification,
+        report,
     )

@@ -8,7 +8,7 @@ import numpy as np
 from amers.services.conventions import CHIP_SIZE, MAX_ERROR_SIGMAS
 from amers.services.errors import ComputationError, CoverageError, NoConsensus, NotEnoughPoints
 from amers.services.imagery.line_breaks import scene_breaks
-from amers.services.imagery.scene import Scene, scene_centre, scene_gsd_m
+from amers.services.imagery.scene import Scene, scene_centre, scene_gsd_m, with_pixel_findings
 from amers.services.imagery.source import (
     CachedImage,
     ImageSource,
@@ -132,6 +132,7 @@ def register_on_reference(
         BrokenImage: too few places were found, or agree, and lines of the image were lost or repeated.
         InputError: heights move what the scene shows, and there is no terrain.
     """
+    scene = with_pixel_findings(scene)
     context = _ReferenceContext(
         scene=scene,
         options=options,

@@ -80,6 +80,7 @@ def build_report(
         cell_stability=qualification.cell_stability,
         predicted=qualification.predicted,
         coverage=qualification.coverage,
+        findings=qualification.findings,
         checks=checks,
         marks=registration.marks,
         figure_data=figure_data,

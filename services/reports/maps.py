@@ -115,24 +115,16 @@ def residual_map(report: RegistrationReport) -> Figure:
 
 
 def coverage_map(report: RegistrationReport) -> Figure:
-    """The points on the image by status and reason, and the cells without an active point.
+    """The points on the image by status and reason, and the area that they hold.
 
-    Points on the image. Cells in orange hold no active point;
+    Points on the image. The outline surrounds the area that active points hold;
     """
     groups = _groups(report)
     below = 8.0 + _LEGEND_ROW * ((len(groups) + 1) // 2)
     panel = image_panel(report, darkness=0.6, above=2.0, below=below)
-    figure, cells = panel.figure, report.coverage.cells
-    width, height = panel.width / cells.shape[1], panel.height / cells.shape[0]
-    for row, column in np.argwhere(cells == 0).tolist():
-        corner = panel.left + column * width, panel.top + row * height
-        figure.box(corner, (width, height), DEACTIVATED, opacity=0.2)
-    for k in range(1, cells.shape[1]):
-        x = panel.left + k * width
-        figure.line(np.array([(x, panel.top), (x, panel.top + panel.height)]), NOT_MATCHED, 0.5)
-    for k in range(1, cells.shape[0]):
-        y = panel.top + k * height
-        figure.line(np.array([(panel.left, y), (panel.left + panel.width, y)]), NOT_MATCHED, 0.5)
+    figure = panel.figure
+    for ring in report.coverage.outline:
+        figure.line(panel.places(ring[:, 1], ring[:, 0]), ACTIVE, 1.5)
     crowd = crowding(len(report.figure_data.measures.point_id))
     rows = (len(groups) + 1) // 2
     for k, (label, place, shape, colour) in enumerate(groups):

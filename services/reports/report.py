@@ -15,6 +15,7 @@ from amers.services.quality.accuracy import Accuracy, NormalisedError
 from amers.services.quality.accuracy_statement import AccuracyStatement, StatedAccuracy
 from amers.services.quality.cell_stability import CellStability
 from amers.services.quality.criteria import Criterion, Verdict
+from amers.services.quality.finding import Finding
 from amers.services.quality.marks import MarksReport
 from amers.services.quality.predicted import PredictedAccuracy
 from amers.services.quality.qualification import Coverage, GroundResiduals, PointCounts
@@ -205,7 +206,8 @@ class RegistrationReport:
         cell_stability: the same without the points of one cell at a time: shows errors that neighbours
             share, not those that all points share.
         predicted: accuracy by the covariance of the correction.
-        coverage: of the image by active points.
+        coverage: the part of the image that active points hold; accuracy is stated for it.
+        findings: what the correction does not follow, most harmful first; the accuracy includes them.
         checks: accuracy at points that had no part in the registration.
         marks: what became of marks of a person; null without any.
         figure_data: what the figures of the page draw; not part of report.json.
@@ -231,6 +233,7 @@ class RegistrationReport:
     cell_stability: CellStability
     predicted: PredictedAccuracy
     coverage: Coverage
+    findings: tuple[Finding, ...]
     checks: tuple[Check, ...]
     marks: MarksReport | None
     figure_data: FigureData = field(metadata=NOT_IN_JSON)

@@ -53,7 +53,7 @@ def test_what_blocks_differ_by_is_not_counted_as_common_to_them_again():
 
 
 def test_the_words_state_both_accuracies_in_their_order():
-    assert scene_accuracy(0.114, 3.2, Frame.from_sigmas(1.5, 5.0)).lines == (
+    assert scene_accuracy(0.114, 3.2, Frame.from_sigmas(1.5, 5.0), 100.0).lines == (
         "Relative to the control points: CE90 0.11 m (worst place of the image)",
         "On the Earth: CE90 3.20 m (worst place of the image), LE90 of the control points' frame 8.22 m",
     )
@@ -63,13 +63,22 @@ def test_the_words_state_both_accuracies_in_their_order():
     )
 
 
+@pytest.mark.parametrize(
+    ("share", "words"), [(87.6, "88 %"), (99.9, "99 %"), (0.2, "1 %"), (0.0, "0 %")]
+)
+def test_the_words_say_of_what_part_of_the_image_they_speak(share: float, words: str) -> None:
+    stated = scene_accuracy(0.3, 3.2, Frame.from_sigmas(1.5, 5.0), share)
+    for line in stated.lines:
+        assert f"(worst place of the {words} of the image that points hold)" in line
+
+
 def test_the_words_say_what_is_unknown_and_why():
-    nothing = scene_accuracy(0.11, np.nan, UNKNOWN_FRAME).lines[1]
+    nothing = scene_accuracy(0.11, np.nan, UNKNOWN_FRAME, 100.0).lines[1]
     assert nothing == (
         "On the Earth: CE90 unknown (worst place of the image), LE90 of the control points' frame "
         "unknown: the accuracy of the control points' frame is not stated"
     )
-    no_height = scene_accuracy(0.11, np.nan, Frame.from_sigmas(1.5, np.nan)).lines[1]
+    no_height = scene_accuracy(0.11, np.nan, Frame.from_sigmas(1.5, np.nan), 100.0).lines[1]
     assert no_height.endswith("unknown: the height accuracy of the control points' frame is not stated")
     block = points_accuracy(MEDIAN_M2, Frame.from_sigmas(1.5, np.nan), "median of the points")
     assert block.lines[1] == (
@@ -116,7 +125,7 @@ def test_the_median_point_of_a_block_is_stated_without_and_with_its_frame() -> N
 
 
 def test_a_figure_that_is_unknown_is_null_in_a_document() -> None:
-    document = accuracy_document(scene_accuracy(1.0, np.nan, UNKNOWN_FRAME))
+    document = accuracy_document(scene_accuracy(1.0, np.nan, UNKNOWN_FRAME, 100.0))
     assert document["relative_to_control_points"]["ce90_m"] == 1.0
     assert document["on_the_earth"]["ce90_m"] is None
     assert document["on_the_earth"]["le90_m"] is None

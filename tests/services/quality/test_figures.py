@@ -13,7 +13,7 @@ from amers.services.quality.criteria import (
     verdict_scope,
 )
 from amers.services.quality.predicted import predict_accuracy
-from amers.services.quality.qualification import second_consensus_share, unexplained_px
+from amers.services.quality.qualification import unexplained_px
 from amers.services.types import Array, Frame
 from tests.services.conftest import METRE_DEG, FlatModel
 
@@ -136,20 +136,6 @@ def test_chance_alone_seldom_leaves_anything_unexplained(registered, n):
     # Two standard deviations of each of two variances, beside that of the neighbours.
     assert 0.0 < np.mean(np.array(left) > 0.0) < 0.4
     assert np.quantile(left, 0.9) < 0.9
-
-
-def test_a_second_consensus_is_that_of_another_order_and_of_swapped_axes(registered):
-    rng = np.random.default_rng(3)
-    residual = 0.2 * rng.standard_normal((60, 2))
-    residual[40:52] += [9.0, -6.0]
-    residual[52:] += rng.uniform(-14.0, 14.0, (8, 2))
-    measures = shown(registered().measures, residual, rng.uniform(0.0, 4000.0, (60, 2)))
-    measures = replace(measures, active=np.arange(60) < 40)
-    order = rng.permutation(60)
-    permuted = replace(measures, residual_px=residual[order], active=measures.active[order])
-    swapped = replace(measures, residual_px=residual[:, ::-1])
-    shares = [second_consensus_share(one, 0.0) for one in (measures, permuted, swapped)]
-    assert shares == [12 / 40] * 3
 
 
 @pytest.mark.parametrize("needed_for", ["good", "usable"])

@@ -10,6 +10,7 @@ import pytest
 from amers.services.errors import NotEnoughPoints
 from amers.services.quality.cell_stability import measure_cell_stability
 from amers.services.quality.criteria import verdict_of, verdict_scope
+from amers.services.quality.held_area import held_area
 from amers.services.quality.normal_law import CIRCULAR_CE90
 from amers.services.quality.predicted import predict_accuracy
 from amers.services.quality.qualification import (
@@ -18,7 +19,6 @@ from amers.services.quality.qualification import (
     image_coverage,
     qualify,
     qualify_repeated,
-    second_consensus_share,
     unexplained_px,
 )
 from amers.services.quality.stability import measure_stability, stability_of
@@ -53,11 +53,10 @@ def test_criteria_show_hundredths_of_pixels_and_metres_and_whole_percents_of_an_
     scene = registered().adjusted()
     criteria = qualify(scene, DEFAULT, np.random.default_rng(3)).criteria
     digits = {"px": 2, "m": 2, "%": 0}
-    growth = "correction_against_height"  # has a limit of 0.6 %
     of_a_unit = [one for one in criteria if one.unit]
     assert {one.unit for one in of_a_unit} >= {"px", "%"}
     for one in of_a_unit:
-        assert one.decimals == (2 if one.name == growth else digits[one.unit]), one.name
+        assert one.decimals == digits[one.unit], one.name
 
 
 def test_visible_matched_and_active_points_are_counted(registered):
@@ -124,8 +123,9 @@ def test_displacements_are_those_of_the_corners_and_the_centre(registered):
         scene.adjustment.correction,
         parameters=scene.adjustment.correction.parameters + [[0.0, 0.3, 0.0], [0.4, 0.0, 0.0]],
     )
-    result = qualified(scene, refit=lambda mask: replace(scene.adjustment, correction=moved))
-    at = {place.place: place for place in result.stability.displacements}
+    adjusted = scene.adjusted(lambda mask: replace(scene.adjustment, correction=moved))
+    stability = measure_stability(adjusted, 5, 0.8, np.random.default_rng(3))
+    at = {place.place: place for place in stability.displacements}
     assert at["centre"].median_px == pytest.approx(0.4, abs=a_millionth_px)
     assert at["top left"].max_px == pytest.approx(0.5, rel=1e-3)
     assert at["bottom right"].max_m == pytest.approx(0.25, rel=1e-3)
@@ -194,11 +194,14 @@ def test_the_prediction_grows_towards_the_edge_along_a_drift(registered):
     assert np.isnan(result.on_the_earth_worst_m)
 
 
-def test_coverage_is_the_share_of_cells_with_an_active_point():
+def test_points_are_counted_in_cells_beside_the_share_of_the_image_that_they_hold():
     line_sample = np.array([[-0.5, -0.5], [10.0, 10.0], [99.4, 199.4], [50.0, np.nan]])
-    coverage = image_coverage(line_sample, (100, 200), 5)
-    assert (coverage.occupied, coverage.percent) == (2, 8.0)
+    held = held_area(line_sample[:3], np.empty((0, 2)), (100, 200), 0.0)
+    coverage = image_coverage(line_sample, held, 5)
     assert (coverage.cells[0, 0], coverage.cells[4, 4]) == (2, 1)
+    assert coverage.percent == held.percent
+    places = np.random.default_rng(1).uniform(0.0, 100.0, (500, 2)) * [1.0, 2.0]
+    np.testing.assert_array_equal(coverage.holds(places), held.holds(places))
 
 
 @pytest.mark.parametrize(
@@ -211,7 +214,6 @@ def test_coverage_is_the_share_of_cells_with_an_active_point():
         ("good_displacement_px", 0.0001, ("displacement_px", "good")),
         ("good_ce90_px", 0.001, ("predicted_ce90_px", "good")),
         ("good_unit_weight", 0.1, ("unit_weight", "good")),
-        ("good_second_consensus_share", -0.1, ("second_consensus_share", "good")),
         ("usable_active_points", 1000, ("active_points", "usable")),
         ("usable_residual_std_px", 0.01, ("residual_std_px", "usable")),
         ("usable_displacement_px", 0.0001, ("displacement_px", "usable")),
@@ -417,20 +419,6 @@ def test_an_error_of_the_model_is_no_scatter_of_points(registered, stated_px):
     assert scattered == pytest.approx(np.sqrt(unexplained), abs=0.5)
 
 
-def test_two_consensuses_of_many_points_are_not_good(registered):
-    scene = registered(n=60, lost=0, wrong=0)
-    residual_px, active = scene.measures.residual_px.copy(), scene.measures.active.copy()
-    residual_px[:25] += [8.0, -3.0]
-    active[:25] = False
-    two = replace(scene.measures, residual_px=residual_px, active=active)
-    for stated_px in (0.0, 7.5):
-        assert second_consensus_share(two, stated_px) == pytest.approx(25 / active.sum())
-    assert second_consensus_share(two, 9.5) == 0.0, "within the accuracy of the scene"
-    assert ("second_consensus_share", "good") in failed(qualified(replace(scene, measures=two)))
-    residual_px[:25] += np.random.default_rng(1).uniform(-60.0, 60.0, (25, 2))
-    assert second_consensus_share(replace(two, residual_px=residual_px), 0.0) < 0.2
-
-
 def test_nineteen_active_points_are_never_good(registered):
     scene = registered(n=19, lost=0, wrong=0)
     result = qualified(scene, replace(DEFAULT, good_coverage_percent=0.0))
@@ -441,7 +429,7 @@ def test_nineteen_active_points_are_never_good(registered):
 
 def test_points_in_a_corner_are_never_good(registered):
     result = qualified(registered(n=100, extent=0.5))
-    assert result.coverage.percent == 36.0
+    assert 20.0 < result.coverage.percent < 45.0
     assert ("coverage_percent", "good") in failed(result)
     assert result.verdict != "good"
 
@@ -492,22 +480,3 @@ def test_a_frame_that_nobody_stated_does_not_meet_a_limit_on_the_earth(registere
     assert result.verdict == "failed"
     (criterion,) = [c for c in result.criteria if not c.met]
     assert criterion.note == "unknown: the accuracy of the control points' frame is not stated"
-
-
-@pytest.mark.parametrize("along", [0, 1])
-def test_points_at_a_border_speak_against_a_scene_beyond_its_stated_accuracy_alone(registered, along):
-    scene = registered()
-    rows = np.argsort(scene.measures.line_sample[:, along])[:5]
-    name = ("missed_along_lines", "missed_along_samples")[along]
-    for times, told in ((0.8, False), (1.2, True)):
-        adjusted = scene.adjusted(None)
-        expected = adjusted.model.project(scene.measures.lon_lat_h)
-        predicted_px = np.median(predict_accuracy(adjusted, DEFAULT.grid).ce90_px)
-        place = scene.measures.line_sample.copy()
-        place[rows] = expected[rows] + [0.0, times * predicted_px]
-        active, reason = scene.measures.active.copy(), scene.measures.reason.copy().astype(object)
-        active[rows], reason[rows] = False, "deactivated"
-        measures = replace(scene.measures, line_sample=place, active=active, reason=reason.astype(str))
-        assert (
-            name in {name for name, _ in failed(qualified(replace(scene, measures=measures)))}
-        ) is told

@@ -1,0 +1,170 @@
+"""What the correction of a scene does not follow: each finding with the harm that it leaves.
+
+A finding has no limit of its own. What it leaves in the delivered image, one standard deviation of a
+position, enters the accuracy that is stated for every place; what makes a part of the image unknown
+takes that part out of the area for which accuracy is stated. Verdicts follow from these two alone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from amers.services.conventions import CHIP_SIZE
+from amers.services.imagery.line_breaks import format_breaks
+from amers.services.imagery.pixel_checks import Fault, PixelFinding
+from amers.services.matching.consensus import consensus_tolerance_px
+from amers.services.misfit.broken_image import FEWEST_IN_PART, held_parts
+from amers.services.misfit.structure import Structure
+from amers.services.quality.finding import Finding
+from amers.services.quality.held_area import HeldArea, held_area
+from amers.services.quality.line_of_sight import ImpliedSight, implied_sight
+from amers.services.quality.normal_law import CIRCULAR_CE90
+from amers.services.quality.points_elsewhere import agree_elsewhere, elsewhere_words
+from amers.services.quality.sight_errors import SightError, sight_error
+from amers.services.quality.stability import AdjustedScene
+from amers.services.quality.structure_words import structure_words
+from amers.services.types import Array
+
+MOST_CHANCE = 1e-4
+"""A structure that chance explains with a larger probability is not told; its harm counts."""
+
+
+def with_findings(scene: AdjustedScene) -> AdjustedScene:
+    """A scene with what its correction does not follow, whose harm every accuracy includes.
+
+    Args:
+        scene: after its final adjustment.
+    """
+    notes = [
+        *_of_breaks(scene),
+        *_of_structures(scene),
+        *_of_sight(scene),
+        *_of_pixels(scene.pixel_findings),
+    ]
+    held = _held(scene)
+    if scene.elsewhere is not None and scene.elsewhere.slope_px is None:
+        notes.append(_of_elsewhere(scene, held))
+    notes.sort(key=lambda one: -float(np.hypot(*one.harm_px)))
+    harm_px = np.sqrt(np.sum([one.harm_px**2 for one in notes], axis=0)) if notes else np.zeros(2)
+    local_px = np.hypot(scene.adjustment.local_sigma_px, harm_px)
+    adjustment = replace(scene.adjustment, local_sigma_px=local_px)
+    return replace(scene, adjustment=adjustment, findings=tuple(notes), held=held)
+
+
+def _of_breaks(scene: AdjustedScene) -> list[Finding]:
+    """Breaks of the image; each part holds its own place by its own points, or no accuracy is stated."""
+    if scene.breaks is None or not len(scene.breaks):
+        return []
+    line = scene.measures.line_sample[scene.measures.active, 0]
+    parts = held_parts(scene.breaks, line, np.ones(len(line), dtype=bool))
+    unheld = int((~parts).sum())
+    words = format_breaks(scene.breaks)
+    if unheld:
+        words += (
+            f"; fewer than {FEWEST_IN_PART} points agree in {unheld} of the {len(parts)} parts: cut the "
+            "image there, and register its parts"
+        )
+    return [Finding("breaks", np.zeros(2), words)]
+
+
+def _of_structures(scene: AdjustedScene) -> list[Finding]:
+    """Structures of the residuals. Those along places and within chips are in the stated accuracy."""
+    found = scene.adjustment.structures
+    told = [one for one in found if one.chance < MOST_CHANCE and one.family != "height"]
+    return [_note(one, scene.shape) for one in told]
+
+
+def _note(structure: Structure, shape: tuple[int, int]) -> Finding:
+    words = f"{structure_words(structure, shape)} (p = {structure.chance:.1g})"
+    return Finding(f"structure_{structure.family}", np.zeros(2), words)
+
+
+def _of_sight(scene: AdjustedScene) -> list[Finding]:
+    """The clearest sign that heights move points otherwise than the model says, if there is one."""
+    slopes = [one.slope_px for one in scene.adjustment.structures if _moves_with_height(one)]
+    if scene.elsewhere is not None and scene.elsewhere.slope_px is not None:
+        slopes.append(scene.elsewhere.slope_px)
+    error = sight_error(scene, slopes, _implied(scene))
+    return [] if error is None else [_sight_note(error)]
+
+
+def _moves_with_height(structure: Structure) -> bool:
+    return structure.family == "height" and structure.chance < MOST_CHANCE
+
+
+def _implied(scene: AdjustedScene) -> ImpliedSight | None:
+    """The line of sight that shears of chips imply; None where they hardly tell."""
+    if scene.shears is None:
+        return None
+    derivative = scene.model.project_derivative(scene.measures.lon_lat_h[scene.shears.point])
+    lean = np.linalg.solve(derivative[:, :, :2], derivative[:, :, 2:])[:, :, 0]
+    return implied_sight(scene.shears, np.asarray(lean, np.float64))
+
+
+def _sight_note(error: SightError) -> Finding:
+    return Finding("line_of_sight", error.harm_px, error.words)
+
+
+def _of_pixels(found: Sequence[PixelFinding]) -> list[Finding]:
+    """Faults that displace all pixels, or some of them everywhere."""
+    return [
+        Finding("pixels", _harm_of_pixels(one), one.words)
+        for one in found
+        if one.kind in (Fault.ODD_LINES, Fault.ODD_SAMPLES, Fault.BANDS, Fault.SECOND_IMAGE)
+    ]
+
+
+def _harm_of_pixels(fault: PixelFinding) -> Array:
+    """Standard deviation (2,) whose CE90 is half of the displacement: matches lie between both."""
+    return np.full(2, np.nan_to_num(fault.amount_px) / 2.0 / CIRCULAR_CE90)
+
+
+def _of_elsewhere(scene: AdjustedScene, held: HeldArea) -> Finding:
+    """Points that agree on another place: harm where they lie among those that agree with the scene."""
+    group = scene.elsewhere
+    assert group is not None
+    expected = scene.model.project(scene.measures.lon_lat_h)
+    among = int(held.holds(expected[group.rows]).sum())
+    share = among / max(among + int(scene.measures.active.sum()), 1)
+    harm_px = np.sqrt(share) * np.abs(group.displacement_px) / np.sqrt(2.0)
+    words = elsewhere_words(group, expected, scene.measures.active)
+    return Finding("points_elsewhere", harm_px, words)
+
+
+def _held(scene: AdjustedScene) -> HeldArea:
+    """The area that the points of a scene hold."""
+    measures = scene.measures
+    expected = scene.model.project(measures.lon_lat_h)
+    active_px = measures.residual_px[measures.active]
+    rms_px = float(np.sqrt((active_px**2).mean())) if len(active_px) else 0.0
+    away = agree_elsewhere(
+        expected,
+        measures.line_sample - expected,
+        measures.matched & ~measures.active,
+        consensus_tolerance_px(rms_px),
+    )
+    if scene.elsewhere is not None:
+        away[scene.elsewhere.rows] = True
+    agreeing = measures.line_sample[measures.active]
+    if scene.tie_places is not None:
+        agreeing = np.concatenate([agreeing, scene.tie_places])
+    chip_side_px = CHIP_SIZE * scene.control_gsd_m / scene.gsd_m
+    return held_area(agreeing, expected[away], scene.shape, chip_side_px, _parts(scene))
+
+
+def _parts(scene: AdjustedScene) -> Array:
+    """Parts (p, 4) of the image that lie by themselves: first and last lines and samples."""
+    lines, samples = scene.shape
+    breaks = np.zeros(0, dtype=np.int64) if scene.breaks is None else scene.breaks
+    edges = [0, *breaks.tolist(), lines]
+    parts = [(first, end - 1, 0, samples - 1) for first, end in pairwise(edges) if len(edges) > 2]
+    for one in scene.pixel_findings:
+        if one.kind in (Fault.LOST_SAMPLES, Fault.REPEATED_SAMPLES):
+            behind = one.sample + (1 if one.kind == Fault.LOST_SAMPLES else 0)
+            parts += [(0, lines - 1, 0, behind - 1), (0, lines - 1, behind, samples - 1)]
+        elif one.kind == Fault.PART:
+            last = one.line + one.lines - 1, one.sample + one.samples - 1
+            parts.append((one.line, last[0], one.sample, last[1]))
+    return np.array(parts, dtype=np.float64).reshape(-1, 4)

@@ -1,0 +1,158 @@
+"""The part of an image that its points hold: where its accuracy is known, and stated.
+
+A correction is checked where points agree with it. Elsewhere it is an extrapolation, and what a scanner
+did there (lines lost, an attitude that jumped) nobody saw. A place is held by an agreeing point within
+a reach, unless as many points there agree with each other on another displacement.
+
+The reach is the distance within which a typical point has four others, and at least that to the corners
+of a chip, which shows all of its square. Of points at random, none lies
+within it of a place by a chance of exp(-4): where none agrees, something is other than elsewhere, be it
+cloud, water, changed ground or lines that were lost. Nobody need know which: nothing is stated there.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import rasterio.features
+import shapely
+from rasterio.transform import Affine
+from scipy.spatial import KDTree
+from shapely.geometry.base import BaseGeometry
+
+from amers.services.misfit.broken_image import FEWEST_IN_PART
+from amers.services.types import Array, BoolArray
+
+NEIGHBOURS = 4
+"""Other points within the reach of a typical one: exp(-4) = 2 % of a clean image are lost."""
+MOST_REACH = 0.15
+"""Reach at most, sides of a square image of as many pixels: a limit that people set. One point in the
+middle of each fifth of both axes holds the whole image."""
+_CELLS = 50
+"""Along each side of an image, of the raster in which the area is told: two percent, as the chance
+above."""
+
+
+@dataclass(frozen=True)
+class HeldArea:
+    """The part of an image that points hold.
+
+    Attributes:
+        cells: (c, c) whether each cell of the image is held, rows from the first line down.
+        shape: lines and samples of the image.
+        reach_px: of a point.
+    """
+
+    cells: BoolArray
+    shape: tuple[int, int]
+    reach_px: float
+
+    @classmethod
+    def whole(cls, shape: tuple[int, int]) -> Self:
+        """All of an image: of a few marks, whose correction is held by its priors alone."""
+        cells = np.ones((_CELLS, _CELLS), dtype=bool)
+        return cls(cells, cells, shape, float(np.hypot(*shape)))
+
+    @property
+    def percent(self) -> float:
+        """Share of the image, 0 to 100."""
+        return 100.0 * float(self.cells.mean())
+
+    @property
+    def places(self) -> Array:
+        """Line and sample (k, 2) of the middles of the cells that are held."""
+        return cell_places(self.shape)[self.cells.ravel()]
+
+    @property
+    def outline(self) -> BaseGeometry:
+        """The area as polygons, x samples and y lines, pixels from the middle of the first."""
+        height, width = (size / _CELLS for size in self.shape)
+        transform = Affine(width, 0.0, -0.5, 0.0, height, -0.5)
+        found = rasterio.features.shapes(
+            self.cells.astype(np.uint8), mask=self.cells, transform=transform
+        )
+        return shapely.union_all([shapely.geometry.shape(geometry) for geometry, _ in found])
+
+    @property
+    def rings(self) -> tuple[Array, ...]:
+        """The outline as closed rings (n, 2) of line and sample, each followed by its holes."""
+        polygons = shapely.get_parts(self.outline)
+        rings = [ring for one in polygons for ring in (one.exterior, *one.interiors)]
+        return tuple(np.asarray(ring.coords)[:, ::-1] for ring in rings)
+
+    def nearest(self, line_sample: Array) -> Array:
+        """Places (n, 2), each moved to the nearest that is held; as they are where none is."""
+        places = self.places
+        if not len(places):
+            return line_sample
+        _, row = KDTree(places).query(line_sample)
+        return np.where(self.holds(line_sample)[:, None], line_sample, places[row])
+
+    def holds(self, line_sample: Array) -> BoolArray:
+        """Which places (n, 2) of the image lie in it; none beside the image does."""
+        cell = np.floor((line_sample + 0.5) / (np.array(self.shape) / _CELLS))
+        inside = np.asarray(((cell >= 0) & (cell < _CELLS)).all(axis=1))
+        row = np.where(inside[:, None], cell, 0).astype(np.int64)
+        return inside & self.cells[row[:, 0], row[:, 1]]
+
+
+def cell_places(shape: tuple[int, int]) -> Array:
+    """Line and sample (c * c, 2) of the middles of the cells of an image."""
+    axes = [(np.arange(_CELLS) + 0.5) * size / _CELLS - 0.5 for size in shape]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def held_area(
+    agreeing: Array,
+    elsewhere: Array,
+    shape: tuple[int, int],
+    chip_side_px: float,
+    parts: Array | None = None,
+) -> HeldArea:
+    """The part of an image that points hold.
+
+    Args:
+        agreeing: (n, 2) line and sample of points that agree with the scene.
+        elsewhere: (k, 2) of points that agree with each other on another displacement.
+        shape: lines and samples of the image.
+        chip_side_px: of the chips of the points in the image: all that a chip shows has been compared.
+        parts: (p, 4) first and last lines and samples of parts of the image that lie by themselves,
+            such as between breaks: three points or more hold a part, and none of another part does.
+            None for none.
+    """
+    reach_px = max(_reach_px(agreeing, shape), chip_side_px / np.sqrt(2.0))
+    places = cell_places(shape)
+    held = _are_held(agreeing, elsewhere, places, reach_px)
+    for bounds in np.empty((0, 4)) if parts is None else parts:
+        of_part, own, other = (_inside(one, bounds) for one in (places, agreeing, elsewhere))
+        held[of_part] &= own.sum() >= FEWEST_IN_PART
+        held[of_part] &= _are_held(agreeing[own], elsewhere[other], places[of_part], reach_px)
+    return HeldArea(held.reshape(_CELLS, _CELLS), shape, reach_px)
+
+
+def _inside(line_sample: Array, bounds: Array) -> BoolArray:
+    """Which places (n, 2) lie between first and last line, first and last sample."""
+    low, high = bounds[[0, 2]] - 0.5, bounds[[1, 3]] + 0.5
+    return np.asarray(((line_sample > low) & (line_sample < high)).all(axis=1))
+
+
+def _are_held(agreeing: Array, elsewhere: Array, places: Array, reach_px: float) -> BoolArray:
+    """Which places (m, 2) have an agreeing point in reach, and fewer points that agree elsewhere."""
+    votes = _within(agreeing, places, reach_px)
+    return np.asarray((votes > 0) & (votes > _within(elsewhere, places, reach_px)))
+
+
+def _reach_px(agreeing: Array, shape: tuple[int, int]) -> float:
+    """Median distance to the fourth neighbour among points (n, 2), at most the largest reach."""
+    most_px = MOST_REACH * float(np.sqrt(shape[0] * shape[1]))
+    if len(agreeing) <= NEIGHBOURS:
+        return most_px
+    distance, _ = KDTree(agreeing).query(agreeing, k=NEIGHBOURS + 1)
+    return min(float(np.median(distance[:, -1])), most_px)
+
+
+def _within(points: Array, places: Array, reach_px: float) -> Array:
+    """Number (m,) of points (n, 2) within a reach of places (m, 2)."""
+    if not len(points):
+        return np.zeros(len(places))
+    counts = KDTree(points).query_ball_point(places, reach_px, return_length=True)
+    return np.asarray(counts, np.float64)

@@ -1,0 +1,106 @@
+"""The part of an image that points hold: nearly all where they agree everywhere, and no more."""
+
+import numpy as np
+import pytest
+import shapely
+
+from amers.services.quality.held_area import HeldArea, held_area
+from amers.services.types import Array
+
+SHAPE = (1000, 2000)
+NOBODY = np.empty((0, 2))
+CHIP_PX = 40.0
+
+
+def all_over(n: int, seed: int = 0) -> Array:
+    """Points at random places of the image."""
+    return np.random.default_rng(seed).uniform(0.0, 1.0, (n, 2)) * SHAPE
+
+
+def held(agreeing: Array, elsewhere: Array = NOBODY, parts: Array | None = None) -> HeldArea:
+    return held_area(agreeing, elsewhere, SHAPE, CHIP_PX, parts)
+
+
+@pytest.mark.parametrize("n", [60, 200, 1000])
+def test_points_all_over_an_image_hold_nearly_all_of_it(n: int) -> None:
+    """By chance exp(-4) of the places have no point in reach; the borders a little more."""
+    percent = [held(all_over(n, seed)).percent for seed in range(10)]
+    assert 90.0 < np.mean(percent) < 99.5
+
+
+def test_a_point_in_the_middle_of_every_fifth_holds_the_whole_image() -> None:
+    """What 15 % of a side means."""
+    square = 1000
+    axis = (np.arange(5) + 0.5) * square / 5 - 0.5
+    points = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    assert held_area(points, NOBODY, (square, square), 0.0).percent == 100.0
+    assert held_area(points[:-1], NOBODY, (square, square), 0.0).percent < 100.0
+
+
+def test_lines_in_which_no_point_agrees_are_not_held() -> None:
+    """An eighth of the image behind lost lines: most of it is beyond the reach of the others."""
+    points = all_over(300)
+    before = points[points[:, 0] < 875.0]
+    area = held(before)
+    line = area.places[:, 0]
+    assert line.max() < 875.0 + area.reach_px
+    assert area.reach_px < 100.0
+    assert 80.0 < area.percent < 95.0
+
+
+def test_a_part_that_agrees_elsewhere_is_not_held_and_the_rest_is() -> None:
+    points = all_over(400)
+    pasted = (np.abs(points - [500.0, 600.0]) < 175.0).all(axis=1)
+    area = held(points[~pasted], points[pasted])
+    inside = (np.abs(area.places - [500.0, 600.0]) < 150.0).all(axis=1)
+    assert inside.sum() < 0.02 * len(area.places)
+    assert area.percent > 85.0
+
+
+def test_what_a_chip_shows_is_held_by_it() -> None:
+    area = held_area(np.array([[500.0, 1000.0]]), NOBODY, SHAPE, 800.0)
+    corners = np.array([[110.0, 610.0], [890.0, 610.0], [110.0, 1390.0], [890.0, 1390.0]])
+    assert area.holds(corners).all()
+    assert not area.holds(np.array([[500.0, 100.0]])).any()
+
+
+@pytest.mark.parametrize(("behind", "holds"), [(2, False), (3, True)])
+def test_points_of_one_part_hold_nothing_of_another(behind: int, holds: bool) -> None:
+    """Lines were lost at line 900: what lies behind them is held by three points of its own, or not."""
+    points = all_over(300)
+    points = np.concatenate([points[points[:, 0] < 899.0], np.array([[950.0, 500.0]] * behind)])
+    parts = np.array([[0.0, 899.0, 0.0, 1999.0], [900.0, 999.0, 0.0, 1999.0]])
+    area = held(points, parts=parts)
+    assert not area.holds(np.array([[930.0, 1500.0]])).any()
+    assert area.holds(np.array([[950.0, 510.0]])).all() == holds
+    assert held(points).holds(np.array([[905.0, 1500.0]])).all(), "without the break"
+
+
+def test_the_outline_surrounds_the_places_that_are_held_with_their_holes() -> None:
+    points = all_over(300)
+    hole = np.hypot(*(points - [500.0, 1000.0]).T) < 300.0
+    area = held(points[~hole])
+    polygons = area.outline
+    assert polygons.area == pytest.approx(area.percent / 100.0 * SHAPE[0] * SHAPE[1])
+    assert not shapely.contains_xy(polygons, 1000.0, 500.0)
+    places = all_over(500, seed=1)
+    inside = shapely.contains_xy(polygons, places[:, 1], places[:, 0])
+    np.testing.assert_array_equal(inside, area.holds(places))
+    assert not area.holds(np.array([[-5.0, 50.0], [50.0, 2003.0]])).any()
+
+
+def test_places_beyond_the_area_move_to_its_nearest() -> None:
+    points = all_over(300)
+    area = held(points[points[:, 1] < 1000.0])
+    corner, inside = np.array([[0.0, 1999.0]]), points[:1] * [1.0, 0.2]
+    moved = area.nearest(corner)
+    assert area.holds(moved).all()
+    assert np.hypot(*(moved - corner).T) == pytest.approx(np.hypot(*(area.places - corner).T).min())
+    np.testing.assert_array_equal(area.nearest(inside), inside)
+
+
+def test_an_image_without_points_is_not_held() -> None:
+    area = held(NOBODY)
+    assert area.percent == 0.0
+    assert area.rings == ()
+    np.testing.assert_array_equal(area.nearest(np.array([[3.0, 4.0]])), [[3.0, 4.0]])
