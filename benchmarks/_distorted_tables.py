@@ -15,26 +15,25 @@ FALSE_ALARMS = 0.01
 FOLLOWED, NAMED = 0.8, 0.9
 """Shares that must be delivered and right where a distortion can be followed, and named elsewhere."""
 
-_SEEN_OTHERWISE = ("against_height", "line_of_sight")
-_BREAKS = ("behind_breaks", "lost or repeated lines")
+_BREAKS = ("breaks", "lost or repeated lines")
 LACK_OF_FIT = {
-    "jitter": ("along_lines", "within_chips"),
-    "bow": ("along_lines", "along_samples", "structure_in_image"),
-    "steps": ("along_lines", "points_elsewhere", *_BREAKS),
-    "moved": ("points_elsewhere", "structure_in_image", "second_consensus"),
+    "jitter": ("structure_lines", "structure_steps", "structure_chips"),
+    "bow": ("structure_lines", "structure_samples", "structure_image"),
+    "steps": ("structure_lines", "structure_steps", "points_elsewhere", *_BREAKS),
+    "moved": ("points_elsewhere", "structure_image"),
     "wrong_model": (
-        *_SEEN_OTHERWISE,
+        "line_of_sight",
         "another view",
         "another scene",
         "swapped",
         "mirrored",
         "upside",
     ),
-    "otherwise": ("structure_", "steps_along", "missed_along", "points_elsewhere", *_BREAKS),
-    "parts": ("structure_", "steps_along", "missed_along", "points_elsewhere", *_BREAKS),
+    "otherwise": ("structure_", "points_elsewhere", *_BREAKS),
+    "parts": ("structure_", "points_elsewhere", *_BREAKS),
 }
-"""Parts of the names of criteria, or of why a scene is refused, that tell what a family is."""
-_OF_ANY = (*LACK_OF_FIT["otherwise"], *_SEEN_OTHERWISE)
+"""Parts of the names of findings, or of why a scene is refused, that tell what a family is."""
+_OF_ANY = (*LACK_OF_FIT["otherwise"], "line_of_sight")
 
 Pair = tuple[Drawn, Outcome]
 

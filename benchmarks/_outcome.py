@@ -32,7 +32,7 @@ class Outcome:
 
     Attributes:
         verdict: "good", "usable" or "failed"; "refused" when there is no result.
-        reason: the unmet criteria, or why there is no result.
+        reason: the unmet criteria and the findings, or why there is no result.
         visible, matched, active: numbers of points.
         order: of the correction.
         ce90_before_m: of the delivered model, against the truth on the Earth, over the whole image.
@@ -172,10 +172,11 @@ def _judged(
     right = np.hypot(*on_ground_m(error).T) <= WRONG * local_m
     measures = registration.measures
     lines = np.sort(measures.line_sample[measures.active, 0])
+    told = [one.name for one in quality.findings]
     moved_m = [place.median_m for place in quality.stability.displacements]
     return Outcome(
         verdict=quality.verdict,
-        reason="; ".join(c.name for c in quality.criteria if not c.met),
+        reason="; ".join([c.name for c in quality.criteria if not c.met] + told),
         visible=quality.point_counts.visible,
         matched=quality.point_counts.matched,
         active=quality.point_counts.active,

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from amers.services.errors import NotEnoughPoints
 from amers.services.formats.images.scenes import read_scene
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage, Window
@@ -40,9 +39,15 @@ SIGMA_M = 4.0
 _CROP = 600
 FEWEST_TIES = 12
 """Ties that tell what a date shows; of fewer, nothing is judged."""
+_TOWN_BLUNDER = 2.5
+"""Distances of ties over their median, beyond which they are wrong."""
 _TRIPLES = 3
 """Dates of a block up to which each two of them give ties of another date."""
 _OPTIONS = replace(CHIPS, surface_pairs=0)
+
+
+class TooFewTies(Exception):
+    """What a date shows is not known well enough to judge a registration."""
 
 
 @dataclass(frozen=True)
@@ -79,13 +84,17 @@ def date_view(real_data: Path, pair: DateOnBlock) -> RealView:
         ground.append(found)
         seen.append(shown)
     if sum(map(len, ground)) < FEWEST_TIES:
-        raise NotEnoughPoints(f"{pair.name}: fewer than {FEWEST_TIES} ties")
+        raise TooFewTies(f"{pair.name}: fewer than {FEWEST_TIES} ties")
     placed = scene.model.project(made.points.lon_lat_h)
     line_sample, fitting, offset, noise_px = smoothed_ties(
-        scene.model, np.concatenate(ground), np.concatenate(seen)
+        scene.model,
+        np.concatenate(ground),
+        np.concatenate(seen),
+        blunder=_TOWN_BLUNDER,
+        locally=False,
     )
     if fitting.sum() < FEWEST_TIES:
-        raise NotEnoughPoints(f"{pair.name}: fewer than {FEWEST_TIES} ties")
+        raise TooFewTies(f"{pair.name}: fewer than {FEWEST_TIES} ties")
     return RealView(
         scene,
         _CROP,

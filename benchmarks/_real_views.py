@@ -148,9 +148,17 @@ def ties_of(
 
 
 def smoothed_ties(
-    model: SensorModel, ground: Array, seen: Array
+    model: SensorModel, ground: Array, seen: Array, *, blunder: float = _BLUNDER, locally: bool = True
 ) -> tuple[Array, BoolArray, Array, float]:
     """Where an image shows ground: its model, an affine that fits the ties, and medians of neighbours.
+
+    Args:
+        model: as delivered.
+        ground: (t, 3) of the ties.
+        seen: (t, 2) where the image shows them.
+        blunder: ties farther off than this many times the median are none.
+        locally: whether medians of neighbours are added. Ties between dates err by more than models do
+            beside an affine: they are noisy, and few.
 
     Returns:
         Positions (t, 2); ties (t,) that are no blunders; parameters (3, 2) of the affine; median
@@ -160,17 +168,18 @@ def smoothed_ties(
     misfit = seen - modelled
     fitting = np.isfinite(misfit).all(axis=1)
     offset = np.zeros((3, 2))
+    offset[0] = np.median(misfit[fitting], axis=0)
     for _ in range(_PASSES):
-        design = _design(modelled)
-        offset = np.linalg.lstsq(design[fitting], misfit[fitting], rcond=None)[0]
-        rest = misfit - design @ offset
+        rest = misfit - _design(modelled) @ offset
         far = np.linalg.norm(rest, axis=1)
-        fitting = far < _BLUNDER * np.median(far[fitting])
+        fitting = far < blunder * np.median(far[fitting])
+        offset = np.linalg.lstsq(_design(modelled)[fitting], misfit[fitting], rcond=None)[0]
+    rest = misfit - _design(modelled) @ offset
     places = moved_by(modelled, offset)
-    tree = KDTree(places[fitting])
-    neighbours = min(_NEIGHBOURS, int(fitting.sum()))
-    _, near = tree.query(np.where(np.isfinite(places), places, 0.0), neighbours)
-    places += np.median(rest[fitting][near], axis=1)
+    if locally:
+        tree = KDTree(places[fitting])
+        _, near = tree.query(np.where(np.isfinite(places), places, 0.0), _NEIGHBOURS)
+        places += np.median(rest[fitting][near], axis=1)
     noise_px = float(np.median(np.linalg.norm((seen - places)[fitting], axis=1)))
     return places, fitting, offset, noise_px
 

@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 
-from amers.services.errors import NotEnoughPoints
 from amers.services.imagery.scene import Scene, scene_gsd_m
 from amers.services.imagery.source import ArrayImage, Window
 from amers.services.matching.predict import in_image
@@ -27,7 +26,7 @@ from benchmarks._campaign import Log, fingerprint, run_campaign
 from benchmarks._faulty_pixels import KINDS, Fault, drawn_fault
 from benchmarks._measuring import RESULTS, print_table
 from benchmarks._outcome import SOURCES, Outcome, outcome_of
-from benchmarks._real_dates import PAIRS, date_view
+from benchmarks._real_dates import PAIRS, TooFewTies, date_view
 from benchmarks._real_distorted import LOCATION_M, OPTIONS
 from benchmarks._real_views import VIEWS, RealView, real_view, rpc_of
 from benchmarks._scenes import Truth
@@ -115,7 +114,7 @@ def run_trial(trial: RealTrial, real_data: Path) -> Result:
     """A scene and its outcome."""
     try:
         view = view_named(trial.view, real_data)
-    except NotEnoughPoints as error:
+    except TooFewTies as error:
         return trial, Outcome(UNJUDGED, str(error), 0, 0, 0, "", *[np.nan] * 8)
     return trial, register_trial(trial, view)[0]
 

@@ -48,7 +48,7 @@ def test_a_figure_that_changes_is_seen_in_the_readme(tmp_path, name, key):
 
 
 def test_a_family_that_changes_or_is_left_out_is_seen_in_its_table():
-    text = (ROOT / "docs/methods/lack_of_fit.md").read_text()
+    text = (ROOT / "docs/methods/distorted_scenes.md").read_text()
     parts = KEPT["distorted_simulated"]["families"]["parts"]
     changed = {"families": {**KEPT["distorted_simulated"]["families"], "parts": {**parts, "wrong": 3}}}
     others = {**KEPT, "distorted_simulated": {**KEPT["distorted_simulated"], **changed}}

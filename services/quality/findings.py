@@ -15,12 +15,13 @@ from amers.services.conventions import CHIP_SIZE
 from amers.services.imagery.line_breaks import format_breaks
 from amers.services.imagery.pixel_checks import Fault, PixelFinding
 from amers.services.matching.consensus import consensus_tolerance_px
+from amers.services.matching.predict import in_image
 from amers.services.misfit.broken_image import FEWEST_IN_PART, held_parts
 from amers.services.misfit.structure import Structure
 from amers.services.quality.finding import Finding
 from amers.services.quality.held_area import HeldArea, held_area
 from amers.services.quality.line_of_sight import ImpliedSight, implied_sight
-from amers.services.quality.normal_law import CIRCULAR_CE90
+from amers.services.quality.normal_law import CIRCULAR_CE90, normal_ce90
 from amers.services.quality.points_elsewhere import agree_elsewhere, elsewhere_words
 from amers.services.quality.sight_errors import SightError, sight_error
 from amers.services.quality.stability import AdjustedScene
@@ -50,6 +51,8 @@ def with_findings(scene: AdjustedScene) -> AdjustedScene:
     harm_px = np.sqrt(np.sum([one.harm_px**2 for one in notes], axis=0)) if notes else np.zeros(2)
     local_px = np.hypot(scene.adjustment.local_sigma_px, harm_px)
     adjustment = replace(scene.adjustment, local_sigma_px=local_px)
+    ce90_px = normal_ce90(adjustment.covariance_at(held.places))
+    held = held.where_known(ce90_px)
     return replace(scene, adjustment=adjustment, findings=tuple(notes), held=held)
 
 
@@ -107,18 +110,23 @@ def _sight_note(error: SightError) -> Finding:
     return Finding("line_of_sight", error.harm_px, error.words)
 
 
+_EVERYWHERE = (Fault.ODD_LINES, Fault.ODD_SAMPLES, Fault.BANDS)
+"""Faults that displace many pixels everywhere. Others have a place, and points beside it tell what it
+displaces; a second image leaves the first where it is."""
+
+
 def _of_pixels(found: Sequence[PixelFinding]) -> list[Finding]:
-    """Faults that displace all pixels, or some of them everywhere."""
+    """Faults of the pixels."""
+    nothing = np.zeros(2)
     return [
-        Finding("pixels", _harm_of_pixels(one), one.words)
+        Finding(one.kind.value, _harm_of_pixels(one) if one.kind in _EVERYWHERE else nothing, one.words)
         for one in found
-        if one.kind in (Fault.ODD_LINES, Fault.ODD_SAMPLES, Fault.BANDS, Fault.SECOND_IMAGE)
     ]
 
 
 def _harm_of_pixels(fault: PixelFinding) -> Array:
-    """Standard deviation (2,) whose CE90 is half of the displacement: matches lie between both."""
-    return np.full(2, np.nan_to_num(fault.amount_px) / 2.0 / CIRCULAR_CE90)
+    """Standard deviation (2,) whose CE90 is the displacement: points follow one of both places."""
+    return np.full(2, np.nan_to_num(fault.amount_px) / CIRCULAR_CE90)
 
 
 def _of_elsewhere(scene: AdjustedScene, held: HeldArea) -> Finding:
@@ -151,7 +159,18 @@ def _held(scene: AdjustedScene) -> HeldArea:
     if scene.tie_places is not None:
         agreeing = np.concatenate([agreeing, scene.tie_places])
     chip_side_px = CHIP_SIZE * scene.control_gsd_m / scene.gsd_m
-    return held_area(agreeing, expected[away], scene.shape, chip_side_px, _parts(scene))
+    tried = in_image(expected, scene.shape, 0.0) & (measures.reason != "not_tried")
+    # A chip that reaches beyond the border has no pixels there, but the image has.
+    empty = (measures.reason == "nodata") & in_image(expected, scene.shape, -chip_side_px / 2.0)
+    return held_area(
+        agreeing,
+        expected[away],
+        scene.shape,
+        chip_side_px,
+        _parts(scene),
+        empty=expected[tried & empty],
+        shown=expected[tried & ~empty],
+    )
 
 
 def _parts(scene: AdjustedScene) -> Array:

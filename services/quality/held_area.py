@@ -10,7 +10,8 @@ within it of a place by a chance of exp(-4): where none agrees, something is oth
 cloud, water, changed ground or lines that were lost. Nobody need know which: nothing is stated there.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import rasterio.features
@@ -27,6 +28,9 @@ NEIGHBOURS = 4
 MOST_REACH = 0.15
 """Reach at most, sides of a square image of as many pixels: a limit that people set. One point in the
 middle of each fifth of both axes holds the whole image."""
+MOST_WORSE = 3.0
+"""CE90 of a place over that of half of the places, beyond which no accuracy is stated there: as a result
+is called wrong that is off by more than three times what it states."""
 _CELLS = 50
 """Along each side of an image, of the raster in which the area is told: two percent, as the chance
 above."""
@@ -38,11 +42,13 @@ class HeldArea:
 
     Attributes:
         cells: (c, c) whether each cell of the image is held, rows from the first line down.
+        of_image: (c, c) whether it has pixels, as far as points tell; cells that are held have.
         shape: lines and samples of the image.
         reach_px: of a point.
     """
 
     cells: BoolArray
+    of_image: BoolArray
     shape: tuple[int, int]
     reach_px: float
 
@@ -54,13 +60,24 @@ class HeldArea:
 
     @property
     def percent(self) -> float:
-        """Share of the image, 0 to 100."""
-        return 100.0 * float(self.cells.mean())
+        """Share of the image, 0 to 100; what has no pixels is none of it."""
+        return 100.0 * float(self.cells.sum()) / max(int(self.of_image.sum()), 1)
 
     @property
     def places(self) -> Array:
         """Line and sample (k, 2) of the middles of the cells that are held."""
         return cell_places(self.shape)[self.cells.ravel()]
+
+    def where_known(self, ce90_px: Array) -> Self:
+        """The area without places where the accuracy, (k,) at `places`, is far worse than elsewhere.
+
+        A displacement that is followed is as uncertain as itself where it begins, and beyond the points.
+        """
+        if not np.isfinite(ce90_px).any():
+            return self
+        cells = self.cells.copy()
+        cells[self.cells] = ~(ce90_px > MOST_WORSE * np.nanmedian(ce90_px))
+        return replace(self, cells=cells)
 
     @property
     def outline(self) -> BaseGeometry:
@@ -107,6 +124,9 @@ def held_area(
     shape: tuple[int, int],
     chip_side_px: float,
     parts: Array | None = None,
+    *,
+    empty: Array | None = None,
+    shown: Array | None = None,
 ) -> HeldArea:
     """The part of an image that points hold.
 
@@ -118,6 +138,9 @@ def held_area(
         parts: (p, 4) first and last lines and samples of parts of the image that lie by themselves,
             such as between breaks: three points or more hold a part, and none of another part does.
             None for none.
+        empty: (e, 2) where points were looked for and the image has no pixels: a border of an image that
+            was turned north up. None for none.
+        shown: (m, 2) where points were looked for and it has.
     """
     reach_px = max(_reach_px(agreeing, shape), chip_side_px / np.sqrt(2.0))
     places = cell_places(shape)
@@ -126,7 +149,16 @@ def held_area(
         of_part, own, other = (_inside(one, bounds) for one in (places, agreeing, elsewhere))
         held[of_part] &= own.sum() >= FEWEST_IN_PART
         held[of_part] &= _are_held(agreeing[own], elsewhere[other], places[of_part], reach_px)
-    return HeldArea(held.reshape(_CELLS, _CELLS), shape, reach_px)
+    of_image = held | ~_are_nearer(empty, shown, places)
+    return HeldArea(held.reshape(_CELLS, _CELLS), of_image.reshape(_CELLS, _CELLS), shape, reach_px)
+
+
+def _are_nearer(some: Array | None, others: Array | None, places: Array) -> BoolArray:
+    """Which places (m, 2) are nearer to some points than to others; none without points."""
+    if some is None or others is None or not len(some) or not len(others):
+        return np.zeros(len(places), dtype=bool)
+    near, far = (KDTree(points).query(places)[0] for points in (some, others))
+    return np.asarray(near < far)
 
 
 def _inside(line_sample: Array, bounds: Array) -> BoolArray:

@@ -86,8 +86,8 @@ def _slope_of_correction(scene: AdjustedScene) -> Array | None:
 
     On a slope an affine follows the relief, so that residuals do not show it; but the correction is
     wrong beyond the points, and wherever the ground leaves their plane. Points that leave the plane and
-    still fit the correction show that it is a drift that happens to run up the slope. Steps between lines
-    are no growth: where they are followed, the affine part beside them counts.
+    still fit the correction show that it is a drift that happens to run up the slope. Steps between
+    lines are no growth: where they are followed, the affine part beside them counts.
     """
     measures, adjustment = scene.measures, scene.adjustment
     predicted = measures.predicted[measures.active]

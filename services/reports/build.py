@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from amers.services.imagery.pixel_checks import PixelFinding
 from amers.services.imagery.scene import Scene, scene_footprint, scene_gsd_m
 from amers.services.misfit.affine_fit import Order
 from amers.services.misfit.displacement_components import BENDS, Component
@@ -87,7 +86,7 @@ def build_report(
     )
 
 
-def scene_record(scene: Scene, name: str, pixel_findings: tuple[PixelFinding, ...] = ()) -> SceneRecord:
+def scene_record(scene: Scene, name: str) -> SceneRecord:
     """The facts of a report about a scene, under a name for people."""
     lines, samples = scene.image.shape
     return SceneRecord(
@@ -99,7 +98,7 @@ def scene_record(scene: Scene, name: str, pixel_findings: tuple[PixelFinding, ..
         model=_kind_of_model(scene),
         sigma_m=scene.sigma_m,
         footprint_lon_lat=scene_footprint(scene),
-        pixel_findings=pixel_findings,
+        pixel_findings=scene.pixel_findings or (),
     )
 
 

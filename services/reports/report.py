@@ -81,7 +81,7 @@ class SceneRecord:
         model: kind of the delivered model, such as "RPC".
         sigma_m: accuracy of the model before registration, one standard deviation a coordinate, metres.
         footprint_lon_lat: outline on the ground, degrees, not closed.
-        pixel_findings: what is wrong with its pixels; none in a clean image. No verdict depends on them.
+        pixel_findings: what is wrong with its pixels; none in a clean image.
     """
 
     name: str

@@ -204,9 +204,7 @@ def test_outcomes_of_distorted_scenes_are_read_back(tmp_path: Path) -> None:
 
 def test_what_distorted_scenes_must_show_is_told_from_their_outcomes() -> None:
     in_part = replace(RIGHT, wrong_share=0.2)
-    named = replace(
-        RIGHT, verdict="failed", reason="coverage_percent; structure_along_lines", ce90_m=99.0
-    )
+    named = replace(RIGHT, verdict="failed", reason="coverage_percent; structure_lines", ce90_m=99.0)
     uncertain = replace(RIGHT, verdict="failed", reason="coverage_percent")
     followable = replace(RIGHT, followable=True)
 
@@ -222,6 +220,6 @@ def test_what_distorted_scenes_must_show_is_told_from_their_outcomes() -> None:
     assert not holds([followable] * 3 + [replace(named, followable=True)])[1]
     rows = by_kind("jitter", [(Drawn("sines"), RIGHT), (Drawn("random"), named)])
     assert [rows[kind].right for kind in ("all", "sines", "random")] == [1, 1, 0]
-    assert figures_of("jitter", [named]).told_by == {"coverage_percent": 1, "structure_along_lines": 1}
+    assert figures_of("jitter", [named]).told_by == {"coverage_percent": 1, "structure_lines": 1}
     assert accused([RIGHT] * 200 + [named])[1]
     assert not accused([RIGHT] * 50 + [named])[1]

@@ -98,8 +98,9 @@ export interface CorrelationOptions {
 
 export interface Coverage {
   cells: Numbers[];
-  occupied: number;
   percent: number | null;
+  reach_px: number | null;
+  outline: Numbers[][];
 }
 
 export interface Criterion {
@@ -132,6 +133,12 @@ export interface DrawnDisplacement {
   max_m: number | null;
   x_m: number | null;
   y_m: number | null;
+}
+
+export interface Finding {
+  name: string;
+  harm_px: Numbers[];
+  words: string;
 }
 
 export interface GroundResiduals {
@@ -258,7 +265,6 @@ export interface QualificationOptions {
   good_ce90_m: number | null;
   max_ce90_on_earth_m: number | null | null;
   good_unit_weight: number | null;
-  good_second_consensus_share: number | null;
   usable_active_points: number;
   usable_active_of_few: number | null;
   usable_residual_std_px: number | null;
@@ -342,6 +348,7 @@ export interface Report {
   cell_stability: CellStability;
   predicted: PredictedAccuracy;
   coverage: Coverage;
+  findings: Finding[];
   checks: Check[];
   marks: MarksReport | null;
 }

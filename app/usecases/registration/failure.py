@@ -1,7 +1,7 @@
 """The report of a registration that failed, written where its outputs would have been."""
 
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -51,7 +51,6 @@ class Attempt:
         marks: names of the files of marks; "" for none.
         stages: summaries of the searches, also of one that was refused.
         statements: of the files read, but for those of the scene.
-        pixel_findings: what is wrong with the pixels of the scene, once they were measured.
     """
 
     image: Path
@@ -64,24 +63,24 @@ class Attempt:
     marks: str = ""
     stages: list[SearchStage] = field(default_factory=list)
     statements: list[Statement] = field(default_factory=list)
-    pixel_findings: tuple[PixelFinding, ...] = ()
 
-    def measure_pixels(self) -> None:
-        """Note what is wrong with the pixels of the scene.
+    def with_scene(self, scene: Scene) -> Scene:
+        """Note the scene, and what is wrong with its pixels, which it is returned with.
 
         An image that cannot be read everywhere has no findings: what reads it next says why.
         """
-        assert self.scene is not None
-        image = self.scene.image
+        found: tuple[PixelFinding, ...] = ()
         with suppress(FormatError):
-            self.pixel_findings = pixel_findings(image, visible_bands(image)).findings
+            found = pixel_findings(scene.image, visible_bands(scene.image)).findings
+        self.scene = replace(scene, pixel_findings=found)
+        return self.scene
 
     def scene_record(self) -> SceneRecord | UnreadScene:
         """The facts about the scene; only its name where it was not read."""
         name = scene_name(self.image)
         if self.scene is None:
             return UnreadScene(name)
-        return scene_record(self.scene, name, self.pixel_findings)
+        return scene_record(self.scene, name)
 
     def run_record(self) -> RunRecord:
         """How and when the registration was run; it ends now."""

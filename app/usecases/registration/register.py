@@ -171,8 +171,7 @@ def _register_and_write(
     progress: Progress,
 ) -> RegisteredScene:
     """Register one scene and write the outputs; what is done is noted in the attempt."""
-    scene = attempt.scene = files.read()
-    attempt.measure_pixels()
+    scene = attempt.with_scene(files.read())
     held_out: list[tuple[str, CheckPoints]] = []
     marks = None
     if sources.marks is not None:
@@ -244,7 +243,7 @@ def write_registered(
     )
     report = build_report(
         registration,
-        scene_record(scene, scene_name(files.image), attempt.pixel_findings),
+        scene_record(scene, scene_name(files.image)),
         attempt.run_record(),
         RefinedModelRecord(refined.max_error_px, refined.note),
         figure_data(scene, control.points, control.chips, registration),

@@ -174,8 +174,7 @@ class _Scenes:
                     "rename the image if it is another one"
                 )
                 continue
-            self.attempts[name].scene = scene
-            self.attempts[name].measure_pixels()
+            scene = self.attempts[name].with_scene(scene)
             taken.add(scene.acquisition.image_id)
             self.opened.append(_Read(name, self.place.address_of(name, one.image), one, scene))
 

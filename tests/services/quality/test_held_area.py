@@ -104,3 +104,26 @@ def test_an_image_without_points_is_not_held() -> None:
     assert area.percent == 0.0
     assert area.rings == ()
     np.testing.assert_array_equal(area.nearest(np.array([[3.0, 4.0]])), [[3.0, 4.0]])
+
+
+def test_what_has_no_pixels_is_no_part_of_the_image() -> None:
+    """An image that was turned north up: points were looked for in its empty corners."""
+    tried = all_over(800)
+    empty = tried.sum(axis=1) < 1000.0
+    agreeing = tried[~empty]
+    area = held_area(agreeing, NOBODY, SHAPE, CHIP_PX, empty=tried[empty], shown=agreeing)
+    assert area.percent > 95.0
+    assert area.of_image.mean() == pytest.approx(0.75, abs=0.03)
+    assert held(agreeing).percent == pytest.approx(75.0, abs=4.0)
+
+
+def test_places_that_are_far_less_known_than_half_of_the_others_are_not_held() -> None:
+    area = held(all_over(300))
+    ce90_px = np.where(area.places[:, 0] < 100.0, 3.1, 1.0)
+    known = area.where_known(ce90_px)
+    assert known.places[:, 0].min() > 100.0
+    assert known.places[:, 0].max() == area.places[:, 0].max()
+    np.testing.assert_array_equal(area.where_known(np.minimum(ce90_px, 2.9)).cells, area.cells)
+    unknown = area.where_known(np.full(len(ce90_px), np.nan))
+    np.testing.assert_array_equal(unknown.cells, area.cells)
+    assert held(NOBODY).where_known(np.zeros(0)).percent == 0.0

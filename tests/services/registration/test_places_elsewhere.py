@@ -10,7 +10,7 @@ from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage, CachedImage, Window
 from amers.services.matching.control_points import ChipSearch, PointMatches, match_points
 from amers.services.misfit.scene_adjustment import AdjustmentOptions
-from amers.services.quality.lack_of_fit import Elsewhere
+from amers.services.quality.points_elsewhere import Elsewhere
 from amers.services.registration.context import PointContext
 from amers.services.registration.elsewhere import adjust_with_places
 from amers.services.registration.options import RegistrationOptions
