@@ -249,12 +249,15 @@ def registered_outcome(request: SceneRequest, report: dict[str, Any]) -> Outcome
         "visible": counts["visible"],
         "matched": counts["matched"],
         "active": counts["active"],
+        "held_percent": report["coverage"]["percent"],
         "correction": correction["order"],
         "shift_px": correction["shift_px"],
         "shift_m": correction["shift_m"],
         "residual_rms_px": report["image_residuals_px"]["xy"]["rms"],
         **_check_figures(report["checks"]),
         **_of_marks(report.get("marks")),
+        "refined_model": report["refined_model"]["note"] or None,
+        "refined_model_error_px": report["refined_model"]["max_error_px"],
         "output": request.folder,
         **_notes(report),
     }
@@ -266,7 +269,6 @@ def _notes(report: dict[str, Any]) -> dict[str, Any]:
         "statements": report["run"].get("statements", []),
         "pixel_findings": report["scene"].get("pixel_findings", []),
         "findings": report.get("findings", []),
-        "held_percent": report["coverage"]["percent"],
     }
 
 

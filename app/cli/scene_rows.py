@@ -20,7 +20,15 @@ from amers.services.reports.overview import OverviewRow, format_overview
 
 OVERVIEW = "overview.html"
 """File of the page over the reports of several scenes."""
-_TABLE = ("active", "shift_m", "residual_rms_px", "check_ce90_m", "seconds")
+_TABLE = (
+    "active",
+    "held_percent",
+    "shift_m",
+    "residual_rms_px",
+    "refined_model_error_px",
+    "check_ce90_m",
+    "seconds",
+)
 """Figures of a scene in the table of many scenes."""
 _STATED = ("relative_to_control_points", "on_the_earth")
 """The two accuracies of an outcome."""
