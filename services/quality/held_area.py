@@ -14,9 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-import rasterio.features
 import shapely
-from rasterio.transform import Affine
 from scipy.spatial import KDTree
 from shapely.geometry.base import BaseGeometry
 
@@ -83,11 +81,9 @@ class HeldArea:
     def outline(self) -> BaseGeometry:
         """The area as polygons, x samples and y lines, pixels from the middle of the first."""
         height, width = (size / _CELLS for size in self.shape)
-        transform = Affine(width, 0.0, -0.5, 0.0, height, -0.5)
-        found = rasterio.features.shapes(
-            self.cells.astype(np.uint8), mask=self.cells, transform=transform
-        )
-        return shapely.union_all([shapely.geometry.shape(geometry) for geometry, _ in found])
+        row, column = np.nonzero(self.cells)
+        left, top = column * width - 0.5, row * height - 0.5
+        return shapely.union_all(shapely.box(left, top, left + width, top + height)).simplify(0.0)
 
     @property
     def rings(self) -> tuple[Array, ...]:

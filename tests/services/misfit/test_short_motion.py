@@ -83,7 +83,7 @@ def found(motion: Motion, seed: int, count: int = 100) -> ShortMotion:
 
 @pytest.mark.parametrize("period", [140.0, 200.0, 330.0, 600.0])
 def test_an_oscillation_shorter_than_chips_is_found_with_its_period_and_its_size(period: float) -> None:
-    size_px = (0.7, 1.5)
+    size_px = (1.0, 2.0)
     results = [found(oscillation(period, size_px), seed) for seed in range(8)]
     assert all(one.structure.chance < MAX_CHANCE for one in results)
     assert [one.structure.at for one in results] == pytest.approx([period] * 8, rel=0.08)
