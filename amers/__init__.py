@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from amers.services.errors import ComputationError as ComputationError
     from amers.services.errors import InputError as InputError
     from amers.tasks import correct_vectors as correct_vectors
+    from amers.tasks import mosaic as mosaic
     from amers.tasks import orthorectify as orthorectify
     from amers.tasks import produce_points as produce_points
     from amers.tasks import refine as refine
@@ -49,6 +50,7 @@ __all__ = [
     "correct_vectors",
     "locate",
     "match_images",
+    "mosaic",
     "open_block",
     "open_scene",
     "open_terrain",
@@ -68,6 +70,7 @@ _MODULES = {
     "amers.services.errors": ("AmersError", "ComputationError", "InputError"),
     "amers.tasks": (
         "correct_vectors",
+        "mosaic",
         "orthorectify",
         "produce_points",
         "refine",

@@ -1,4 +1,4 @@
-"""The tasks of the library: refine, register, produce points, orthorectify, surfaces, vectors.
+"""The tasks of the library: refine, register, produce points, maps, surfaces, vectors.
 
 Each calls the use case that the command line and the service call; those have more options.
 """
@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike
 from amers.app.usecases.executors import ComputeOptions
 from amers.app.usecases.image_production import ProductionImages, WorkPlace, run_image_production
 from amers.app.usecases.marked_files import PointStatements
+from amers.app.usecases.mosaic import MosaicFile, MosaicGround, write_mosaic
+from amers.app.usecases.mosaic_scenes import MosaicFiles, MosaicSource, sources_of
 from amers.app.usecases.new_block import BlockIdentity
 from amers.app.usecases.orthorectification import OrthoMap, Orthorectified, run_orthorectification
 from amers.app.usecases.registered_scene import SceneModel
@@ -61,6 +63,8 @@ from amers.services.formats.gcp.reader import StatedByCaller
 from amers.services.formats.sensor_models.rpc_files import ImageFiles
 from amers.services.formats.vector.pixel_coordinates import PixelOrigin
 from amers.services.misfit.affine_fit import Order
+from amers.services.mosaic.layout import MosaicMap
+from amers.services.mosaic.options import MosaicOptions
 from amers.services.orthorectification.rectify import OrthoOptions
 from amers.services.production.image_production import ProductionOptions
 from amers.services.quality.check_points import MARKING_SIGMA_PX, CheckPoints
@@ -428,6 +432,56 @@ def surface(
         opened = [s if isinstance(s, Scene) else stack.enter_context(as_scene(s)) for s in scenes]
         named = [scene_of_file(one.content, image) for one, image in zip(opened, images, strict=True)]
         return write_surface(named, file, options, place=place, progress=progress)
+
+
+def mosaic(
+    scenes: Sequence[Scene | FilePath],
+    output: FilePath,
+    terrain: Terrain | FilePath | None = None,
+    *,
+    registered: FilePath | None = None,
+    gsd_m: float | None = None,
+    level: bool = False,
+    jobs: int = 1,
+    progress: Progress = no_progress,
+) -> MosaicFile:
+    """Write one ortho-image of many scenes, cut where they agree best, and measure the steps at seams.
+
+    Beside the output, NAME.sources.tif has the number of the scene of each pixel, and NAME.seams.gpkg
+    the ground that each scene shows. An interrupted mosaic goes on from where it was.
+
+    Args:
+        scenes: with the same bands: scenes or their paths. What lies whole within those given before is
+            not shown.
+        output: path of the GeoTIFF; an existing file is replaced.
+        terrain: heights of the ground, or a surface: open, or the path of a file that states its
+            vertical datum. By default none, which only images on a map allow.
+        registered: folder of the results of `register_together`, whose models are used. By default
+            those of the scenes.
+        gsd_m: ground sampling of the map, metres. By default that of the finest scene.
+        level: change the grey values of the scenes so that they agree where they overlap. By default
+            not.
+        jobs: processes at once. By default 1: this process.
+        progress: receives the fraction done and a message. By default nothing does.
+
+    Raises:
+        InputError: a file cannot be used, or the scenes have different bands.
+        CoverageError: the terrain does not reach a scene.
+    """
+    files = [_files_of(scene) for scene in scenes]
+    if registered is None:
+        images = [MosaicSource(one.image, model=one.model, crop_origin=one.crop_origin) for one in files]
+    else:
+        images = sources_of(MosaicFiles(tuple(one.image for one in files), Path(registered)))
+    return write_mosaic(
+        images,
+        MosaicGround(None if terrain is None else _terrain_file(terrain)),
+        Path(output),
+        MosaicOptions(level=level),
+        wanted=MosaicMap(gsd_m=gsd_m),
+        place=WorkPlace(compute=ComputeOptions(jobs)),
+        progress=progress,
+    )
 
 
 def correct_vectors(

@@ -14,6 +14,7 @@ import pytest
 import amers
 from amers.app.usecases.vector_files import CorrectionOptions
 from amers.services.matching.tie_points import MatchOptions
+from amers.services.mosaic.options import MosaicOptions
 from amers.services.orthorectification.rectify import OrthoOptions
 from amers.services.production.image_production import ProductionOptions
 from amers.services.registration.options import RegistrationOptions
@@ -28,6 +29,7 @@ TASKS = (
     "correct_vectors",
     "locate",
     "match_images",
+    "mosaic",
     "open_scene",
     "open_terrain",
     "orthorectify",
@@ -133,6 +135,7 @@ def test_defaults_are_those_of_the_science():
     assert default("match_images", "max_ratio") == MatchOptions().max_ratio
     assert default("match_images", "tolerance_px") == MatchOptions().tolerance_px
     assert default("orthorectify", "hide") == OrthoOptions().hide
+    assert default("mosaic", "level") == MosaicOptions().level
     assert default("surface", "pairs") == SurfaceOptions().pairs
     assert default("correct_vectors", "sigma_px") == CorrectionOptions().sigma_px
     assert default("correct_vectors", "pixels") == CorrectionOptions().pixels
@@ -241,8 +244,8 @@ def test_scenes_of_one_name_are_refused_before_any_work():
             amers.register_together(names, "block", "together")
 
 
-def test_there_are_fourteen_recipes_of_some_ten_lines():
-    assert len(RECIPES) == 14 + len(["Errors"])
+def test_there_are_fifteen_recipes_of_some_ten_lines():
+    assert len(RECIPES) == 15 + len(["Errors"])
     assert [name for name, program in RECIPES.items() if len(program.splitlines()) > 10] == []
 
 

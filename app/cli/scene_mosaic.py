@@ -4,7 +4,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
 import typer
 
 from amers.app.cli.box_option import box_of
@@ -17,12 +16,11 @@ from amers.app.cli.terrain_options import TerrainOptions
 from amers.app.errors import InputError
 from amers.app.usecases.executors import ComputeOptions
 from amers.app.usecases.image_production import WorkPlace
-from amers.app.usecases.mosaic import MosaicGround, run_mosaic, step_words
+from amers.app.usecases.mosaic import MosaicGround, box_outline, run_mosaic, step_words
 from amers.app.usecases.mosaic_scenes import MosaicFiles
 from amers.services.mosaic.layout import MosaicMap
 from amers.services.mosaic.options import MosaicOptions
 from amers.services.orthorectification.rectify import OrthoOptions
-from amers.services.types import Array
 
 Files = Annotated[MosaicFiles, Shown(images=typer.Argument(exists=True), registered=None, block=None)]
 
@@ -47,7 +45,11 @@ class MapOptions:
         Raises:
             InputError: the box cannot be used.
         """
-        return MosaicMap(self.crs, self.gsd_m, None if self.bbox is None else _outline(self.bbox))
+        outline = None
+        if self.bbox is not None:
+            box = box_of(self.bbox)
+            outline = box_outline(box.west, box.south, box.east, box.north)
+        return MosaicMap(self.crs, self.gsd_m, outline)
 
 
 @dataclass(frozen=True)
@@ -120,15 +122,3 @@ def mosaic(
         record["pairs"] = [f"{' + '.join(pair['scenes'])}: {step_words(pair)}" for pair in written.pairs]
         record["scenes"] = [f"{one['scene']} {100.0 * one['share']:.1f} %" for one in written.scenes]
     show_one(record, as_json=as_json)
-
-
-def _outline(text: str) -> Array:
-    """Continuous positions (n, 2) along the border of a box."""
-    box = box_of(text)
-    east = box.east + (360.0 if box.east < box.west else 0.0)
-    t = np.linspace(0.0, 1.0, 17)
-    along = np.column_stack([box.west + t * (east - box.west), np.full(len(t), box.south)])
-    up = np.column_stack([np.full(len(t), east), box.south + t * (box.north - box.south)])
-    back = np.column_stack([along[::-1, 0], np.full(len(t), box.north)])
-    down = np.column_stack([np.full(len(t), box.west), up[::-1, 1]])
-    return np.concatenate([along, up, back, down])

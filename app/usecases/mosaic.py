@@ -4,7 +4,7 @@ import hashlib
 import math
 import pickle
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
@@ -17,14 +17,20 @@ import shapely
 from amers.app.errors import InputError
 from amers.app.usecases.executors import open_executor
 from amers.app.usecases.image_production import WorkPlace
-from amers.app.usecases.mosaic_scenes import MosaicFiles, ReadScene, read_mosaic_scenes
+from amers.app.usecases.mosaic_scenes import (
+    MosaicFiles,
+    MosaicSource,
+    ReadScene,
+    read_mosaic_scenes,
+    sources_of,
+)
 from amers.app.usecases.terrain_file import TerrainFile, read_terrain
 from amers.services.errors import CoverageError
 from amers.services.formats.images.ortho import BandForm, write_cog
 from amers.services.formats.vector.seam_layer import write_seam_layer
 from amers.services.formats.work_folder import WorkFolder
 from amers.services.imagery.scene import scene_footprint
-from amers.services.mosaic.layout import MosaicMap, flat_terrain, lay_out
+from amers.services.mosaic.layout import Layout, MosaicMap, flat_terrain, lay_out
 from amers.services.mosaic.mosaic import Mosaic, MosaicTile, make_mosaic, mosaic_tiles
 from amers.services.mosaic.options import MosaicOptions
 from amers.services.mosaic.steps import SeamSteps, StepFigures
@@ -129,12 +135,39 @@ def run_mosaic(
         InputError: a file cannot be used, or the images have different bands or types.
         CoverageError: no scene reaches the map.
     """
-    _check(files, output)
-    read, outside = _near(read_mosaic_scenes(files), wanted.outline)
+    sources = sources_of(files)
+    return write_mosaic(sources, ground, output, options, wanted=wanted, place=place, progress=progress)
+
+
+def write_mosaic(
+    images: Sequence[MosaicSource],
+    ground: MosaicGround,
+    output: Path,
+    options: MosaicOptions,
+    *,
+    wanted: MosaicMap,
+    place: WorkPlace,
+    check: Callable[[Layout, BandForm], None] = lambda _layout, _form: None,
+    progress: Progress = no_progress,
+) -> MosaicFile:
+    """Make a mosaic of images whose models come from anywhere; see `run_mosaic`.
+
+    Args:
+        images: with their models.
+        ground, output, options, wanted, place, progress: as `run_mosaic` takes them.
+        check: refuses a map that may not be made.
+
+    Raises:
+        InputError: a file cannot be used, or the images have different bands or types.
+        CoverageError: no scene reaches the map.
+    """
+    _check(images, output)
+    read, outside = _near(read_mosaic_scenes(images), wanted.outline)
     terrain = _terrain(ground, read)
     layout = lay_out([one.scene for one in read], terrain, wanted)
     layout = replace(layout, left_out=(*outside, *layout.left_out))
     form = read[0].form
+    check(layout, form)
     with ExitStack() as stack:
         folder = place.folder or output.with_name(f"{output.name}.work")
         kept = WorkFolder(folder, _inputs(read, ground, options, wanted), place.most_bytes)
@@ -195,10 +228,20 @@ def step_words(step: dict[str, Any]) -> str:
     return text
 
 
-def _check(files: MosaicFiles, output: Path) -> None:
-    if not 1 <= len(files.images) <= MOST_SCENES:
-        raise InputError(f"{len(files.images)} images found, 1 to {MOST_SCENES:,} expected")
-    if output.resolve() in [path.resolve() for path in files.images]:
+def box_outline(west: float, south: float, east: float, north: float) -> Array:
+    """Continuous positions (n, 2) along the border of a box; one with east below west crosses 180."""
+    east += 360.0 if east < west else 0.0
+    t = np.linspace(0.0, 1.0, 17)
+    along, up = west + t * (east - west), south + t * (north - south)
+    ends = [np.full(len(t), value) for value in (west, south, east, north)]
+    sides = [(along, ends[1]), (ends[2], up), (along[::-1], ends[3]), (ends[0], up[::-1])]
+    return np.concatenate([np.column_stack(side) for side in sides])
+
+
+def _check(images: Sequence[MosaicSource], output: Path) -> None:
+    if not 1 <= len(images) <= MOST_SCENES:
+        raise InputError(f"{len(images)} images found, 1 to {MOST_SCENES:,} expected")
+    if output.resolve() in [one.image.resolve() for one in images]:
         raise InputError(f"{output}: the output would replace an image; choose another name")
 
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from amers.app.errors import InputError
 from amers.app.usecases.orthorectification import pixel_type
 from amers.app.usecases.registered_scene import SceneModel, adjusted_model, read_registered_scene
 from amers.services.errors import FormatError
+from amers.services.formats.block.reader import read_document
 from amers.services.formats.images.bands import one_band
 from amers.services.formats.images.ortho import BandForm
 from amers.services.formats.images.raster import RasterImage
@@ -42,6 +44,27 @@ class MosaicFiles:
 
 
 @dataclass(frozen=True)
+class MosaicSource:
+    """An image of a mosaic and where its model comes from: one of three, or the image itself.
+
+    Attributes:
+        image: raw, or on a map.
+        registration: folder of the registration whose model is used.
+        block: folder of the block whose adjusted model is used.
+        model: file of the model that is used.
+        crop_origin: line and sample of the image in the one that `model` is for; see `read_scene`.
+        name: of the scene in results; by default that of its image.
+    """
+
+    image: Path
+    registration: Path | None = None
+    block: Path | None = None
+    model: Path | None = None
+    crop_origin: tuple[float, float] | None = None
+    name: str | None = None
+
+
+@dataclass(frozen=True)
 class ReadScene:
     """A scene that was read; its file is closed.
 
@@ -60,15 +83,26 @@ class ReadScene:
     statements: Statements
 
 
-def read_mosaic_scenes(files: MosaicFiles) -> list[ReadScene]:
-    """The scenes of some files, one after the other.
+def sources_of(files: MosaicFiles) -> list[MosaicSource]:
+    """The images of some files, and where their models come from.
+
+    Raises:
+        InputError: two places are given.
+    """
+    if files.registered is not None and files.block is not None:
+        raise InputError("one of --registered and --block is expected, not both")
+    if files.registered is None:
+        return [MosaicSource(image, block=files.block) for image in files.images]
+    return [MosaicSource(image, files.registered / scene_name(image)) for image in files.images]
+
+
+def read_mosaic_scenes(sources: Sequence[MosaicSource]) -> list[ReadScene]:
+    """The scenes of some images, one after the other.
 
     Raises:
         InputError: a file cannot be used, or the images have different bands or types.
     """
-    if files.registered is not None and files.block is not None:
-        raise InputError("one of --registered and --block is expected, not both")
-    read = [_read(image, files) for image in files.images]
+    read = [_read(source) for source in sources]
     _check_same(read)
     return read
 
@@ -88,8 +122,10 @@ def _check_same(read: Sequence[ReadScene]) -> None:
                 )
 
 
-def _read(image: Path, files: MosaicFiles) -> ReadScene:
-    scene, delivered, sigma_m = _with_model(image, files)
+def _read(source: MosaicSource) -> ReadScene:
+    scene, delivered, sigma_m = _with_model(source)
+    if source.name is not None:
+        scene = replace(scene, acquisition=replace(scene.acquisition, image_id=source.name))
     raster = scene.image
     assert isinstance(raster, RasterImage | TiledImage)
     try:
@@ -102,24 +138,34 @@ def _read(image: Path, files: MosaicFiles) -> ReadScene:
         raster.close()
     form = BandForm(len(bands), dtype, nodata, saturated)
     one = MosaicScene(replace(scene, image=bands[0], statements=()), bands, delivered, sigma_m)
-    return ReadScene(image, one, form, colours, scene.statements)
+    return ReadScene(source.image, one, form, colours, scene.statements)
 
 
-def _with_model(image: Path, files: MosaicFiles) -> tuple[Scene, SensorModel | None, float]:
+def _with_model(source: MosaicSource) -> tuple[Scene, SensorModel | None, float]:
     """A scene with the model used, its model before registration, and the accuracy of the first."""
-    if files.registered is not None:
-        folder = files.registered / scene_name(image)
-        scene, accuracy = read_registered_scene(SceneModel(image, registration=folder))
+    image = source.image
+    if source.registration is not None:
+        scene, accuracy = read_registered_scene(SceneModel(image, registration=source.registration))
         return scene, _delivered(image), _stated_m(scene, accuracy)
-    if files.block is not None:
-        scene = read_scene(image, adjusted_model(files.block, image), sigma_m=1.0, bands=one_band(1))
-        return scene, _delivered(image), math.nan
+    if source.block is not None:
+        model = adjusted_model(source.block, image)
+        scene = read_scene(image, model, sigma_m=1.0, bands=one_band(1))
+        return scene, _delivered(image), _stated_by_block_m(source.block)
+    given = partial(read_scene, image, source.model, bands=one_band(1), crop_origin=source.crop_origin)
     try:
-        scene = read_scene(image, bands=one_band(1))
+        scene = given()
     except FormatError:
         # An image on a map whose accuracy nobody states; any other error comes again.
-        return read_scene(image, sigma_m=1.0, bands=one_band(1)), None, math.nan
+        return given(sigma_m=1.0), None, math.nan
     return scene, None, scene.sigma_m
+
+
+def _stated_by_block_m(block: Path) -> float:
+    """Accuracy of the adjusted models of a block: of its frame, if known, and what its points share."""
+    frame = read_document(block).metadata.frame
+    covariance = np.nan_to_num(frame.covariance_m2[:2, :2]) + frame.shared_m2[:2, :2]
+    sigma_m = float(np.sqrt(np.trace(covariance) / 2.0))
+    return sigma_m if sigma_m > 0.0 else math.nan
 
 
 def _delivered(image: Path) -> SensorModel:

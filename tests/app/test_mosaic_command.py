@@ -18,6 +18,7 @@ from amers.app.usecases.image_production import WorkPlace
 from amers.app.usecases.mosaic import MosaicFile, MosaicGround, run_mosaic
 from amers.app.usecases.mosaic_scenes import MosaicFiles
 from amers.services.errors import AmersError
+from amers.services.formats.block.writer import write_block
 from amers.services.formats.images.raster import write_raster
 from amers.services.formats.sensor_models.correction_json import format_correction
 from amers.services.mosaic import mosaic as mosaic_module
@@ -25,8 +26,10 @@ from amers.services.mosaic.layout import MosaicMap
 from amers.services.mosaic.options import MosaicOptions
 from amers.services.sensors.correction import ImageCorrection
 from amers.services.sensors.rpc import RpcModel
+from amers.services.types import Frame
 from tests.command_line import amers_here
-from tests.factories import affine_model
+from tests.factories import BOX, affine_model, control_points, metadata, noise_chips
+from tests.factories import images as images_of
 from tests.services.mosaic.worlds import picture
 
 pytestmark = pytest.mark.long
@@ -168,6 +171,29 @@ def test_registered_scenes_fit_where_delivered_ones_do_not(tmp_path: Path) -> No
     assert mosaic.seam_step["median_m"] < 0.1 * mosaic.gsd_m
     assert mosaic.seam_step["delivered"]["median_m"] == pytest.approx(10.0 * mosaic.gsd_m, rel=0.02)
     assert mosaic.scenes[0]["sigma_m"] == pytest.approx(0.2 * mosaic.gsd_m, rel=0.05)
+
+
+def test_models_of_a_block_have_the_accuracy_of_its_frame(
+    images: tuple[Path, ...], tmp_path: Path
+) -> None:
+    names = [path.stem for path in images]
+    points = control_points(4, np.random.default_rng(1), BOX, len(names))
+    named = tuple(replace(one, image_id=name) for one, name in zip(images_of(3), names, strict=True))
+    points = replace(points, views=replace(points.views, images=named))
+    stated = replace(
+        metadata("row"), frame=replace(Frame.from_sigmas(3.0, 9.0), shared_m2=np.eye(3) * 16)
+    )
+    models = {name: model(left) for name, left in zip(names, _LEFT, strict=True)}
+    write_block(tmp_path / "block", stated, points, noise_chips(points), models)
+    mosaic = run_mosaic(
+        MosaicFiles(images, block=tmp_path / "block"),
+        MosaicGround(None, HEIGHT_M),
+        tmp_path / "m.tif",
+        MosaicOptions(),
+        wanted=MosaicMap(),
+        place=WorkPlace(),
+    )
+    assert [one["sigma_m"] for one in mosaic.scenes] == [5.0] * 3
 
 
 def test_a_scene_beyond_the_terrain_is_named(images: tuple[Path, ...], tmp_path: Path) -> None:
