@@ -21,6 +21,7 @@ from amers.services.misfit.placed_measures import PlacedMeasures
 from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.misfit.shared_errors import SharedErrors
 from amers.services.misfit.short_motion import STILL
+from amers.services.misfit.structure import unfollowed_variance_px2
 from amers.services.quality.cell_stability import cell_stability_of, cells_of
 from amers.services.quality.findings import with_findings
 from amers.services.quality.frames import shared_frame, weighted_frame
@@ -81,7 +82,10 @@ def scene_adjustment(block: JointBlock, number: int, options: RegistrationOption
 
 
 def _with_structures(block: JointBlock, number: int, adjustment: SceneAdjustment) -> SceneAdjustment:
-    """The adjustment of a scene, with what the residuals of its control points still depend on."""
+    """The adjustment of a scene, with what the residuals of its control points still depend on.
+
+    Nothing of a block follows that: it is part of the accuracy of every place.
+    """
     measured, adjusted = block.scenes[number], block.model(number)
     if not adjustment.active.any():
         return adjustment
@@ -91,7 +95,13 @@ def _with_structures(block: JointBlock, number: int, adjustment: SceneAdjustment
     fit, _, of_points = declared_fit(model, shape, seen)
     placed = PlacedMeasures.of(model, shape, seen, fit=fit, of_points=of_points)
     tested = placed.structures(fit, adjustment.active, adjustment.components, adjustment.shared)
-    return replace(adjustment, structures=(*tested, adjustment.short_motion.structure))
+    of_image = np.median((1.0 - of_points / fit.variance)[adjustment.active], axis=0)
+    unfollowed = unfollowed_variance_px2(tested, of_image)
+    return replace(
+        adjustment,
+        structures=(*tested, adjustment.short_motion.structure),
+        local_sigma_px=np.sqrt(np.maximum(adjustment.local_sigma_px**2, unfollowed)),
+    )
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from amers.services.conventions import CHIP_SIZE
 from amers.services.imagery.line_breaks import format_breaks
@@ -26,8 +27,10 @@ from amers.services.quality.points_elsewhere import agree_elsewhere, elsewhere_w
 from amers.services.quality.sight_errors import SightError, sight_error
 from amers.services.quality.stability import AdjustedScene
 from amers.services.quality.structure_words import structure_words
-from amers.services.types import Array
+from amers.services.types import Array, Measures
 
+_FEWEST_NEIGHBOURS = 12
+"""Points that show what neighbours share, as they do any structure of the residuals."""
 MOST_CHANCE = 1e-4
 """A structure that chance explains with a larger probability is not told; its harm counts."""
 
@@ -41,6 +44,7 @@ def with_findings(scene: AdjustedScene) -> AdjustedScene:
     notes = [
         *_of_breaks(scene),
         *_of_structures(scene),
+        *_of_neighbours(scene),
         *_of_sight(scene),
         *_of_pixels(scene.pixel_findings),
     ]
@@ -77,6 +81,42 @@ def _of_structures(scene: AdjustedScene) -> list[Finding]:
     found = scene.adjustment.structures
     told = [one for one in found if one.chance < MOST_CHANCE and one.family != "height"]
     return [_note(one, scene.shape) for one in told]
+
+
+def _of_neighbours(scene: AdjustedScene) -> list[Finding]:
+    """What neighbouring points are displaced by together, beyond what the adjustment states.
+
+    Errors of points differ between neighbours, whatever sigmas the points state; an error of the model
+    does not.
+    """
+    shared_px = shared_residual_px(scene.measures)
+    harm_px = np.sqrt(np.maximum(shared_px**2 - scene.adjustment.local_sigma_px**2, 0.0))
+    if not harm_px.any():
+        return []
+    line_px, sample_px = shared_px.tolist()
+    words = (
+        f"neighbouring points are displaced together by {line_px:.2f} px in line and {sample_px:.2f} px "
+        "in sample (one standard deviation), which the correction does not follow. Possible causes: "
+        "errors that the points share, the terrain, or a model with too few free parameters"
+    )
+    return [Finding("neighbours", harm_px, words)]
+
+
+def shared_residual_px(measures: Measures) -> Array:
+    """Standard deviation (2,), line and sample, of the part of the residuals that neighbours share.
+
+    The variance, less half of the mean square of the differences between nearest neighbours, and less
+    two standard deviations of chance: the variance of n residuals has a relative one of sqrt(2 / n).
+    """
+    residual = measures.residual_px[measures.active]
+    if len(residual) < _FEWEST_NEIGHBOURS:
+        return np.zeros(2)
+    place = measures.line_sample[measures.active]
+    _, nearest = KDTree(place).query(place, k=2)
+    between = ((residual - residual[nearest[:, 1]]) ** 2).mean(axis=0) / 2.0
+    chance = 1.0 + 2.0 * np.sqrt(2.0 / len(residual))
+    shared = (residual**2).mean(axis=0) - chance * between
+    return np.asarray(np.sqrt(np.maximum(shared, 0.0)))
 
 
 def _note(structure: Structure, shape: tuple[int, int]) -> Finding:
