@@ -30,6 +30,7 @@ from amers.app.usecases.scene_map import LAYERS, MappedScene, map_scene
 from amers.app.usecases.tokens import create_token
 from amers.services.formats.images.raster import gdal_rpc
 from amers.services.formats.sensor_models.correction_json import format_correction
+from amers.services.quality.correction_accuracy import CorrectionAccuracy
 from amers.services.sensors.correction import ImageCorrection
 from amers.services.sensors.rpc import RpcModel
 from amers.services.sensors.rpc_fit import fit_rpc
@@ -144,9 +145,8 @@ def write_registration(folder: Path, size: int, model: RpcModel) -> None:
         np.full(2, size / 2.0),
     )
     covariance = np.diag([0.01, 0.01, 0.01, 0.01, 0.01, 0.01])
-    text = format_correction(
-        correction, "shift", covariance, np.zeros(2), applies_to="tags", carried="tags"
-    )
+    stated = CorrectionAccuracy(correction, covariance, np.zeros(2))
+    text = format_correction(stated, "shift", applies_to="tags", carried="tags")
     (folder / "correction.json").write_text(text)
     rng = np.random.default_rng(SEED)
     places = model.locate(rng.uniform(0.0, size, (POINTS, 2)), rng.uniform(*HEIGHTS_M, POINTS))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from amers.services.quality.frames import frame_in_image
 from amers.services.sensors.correction import ImageCorrection
-from amers.services.types import Array, Frame
+from amers.services.types import UNKNOWN_FRAME, Array, Frame
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,8 @@ class CorrectionAccuracy:
     correction: ImageCorrection
     covariance_px2: Array
     local_sigma_px: Array
-    frame: Frame
-    apart_px: float
+    frame: Frame = UNKNOWN_FRAME
+    apart_px: float = 0.0
 
     def relative_px2(self, line_sample: Array) -> Array:
         """Covariance (n, 2, 2) of the corrected model at image positions (n, 2), without the frame."""

@@ -24,6 +24,7 @@ from amers.services.formats.sensor_models.correction_json import format_correcti
 from amers.services.mosaic import mosaic as mosaic_module
 from amers.services.mosaic.layout import MosaicMap
 from amers.services.mosaic.options import MosaicOptions
+from amers.services.quality.correction_accuracy import CorrectionAccuracy
 from amers.services.sensors.correction import ImageCorrection
 from amers.services.sensors.rpc import RpcModel
 from amers.services.types import Frame
@@ -151,10 +152,8 @@ def test_registered_scenes_fit_where_delivered_ones_do_not(tmp_path: Path) -> No
         folder = tmp_path / "registered" / f"scene_{number}"
         folder.mkdir(parents=True)
         text = format_correction(
-            correction,
+            CorrectionAccuracy(correction, np.diag([0.04, 0.0, 0.0, 0.04, 0.0, 0.0]), np.zeros(2)),
             "shift",
-            np.diag([0.04, 0.0, 0.0, 0.04, 0.0, 0.0]),
-            np.zeros(2),
             applies_to="a test",
             carried="by nothing",
         )

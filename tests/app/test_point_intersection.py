@@ -20,6 +20,7 @@ from amers.services.formats.images.scenes import read_scene
 from amers.services.formats.sensor_models.correction_json import format_correction
 from amers.services.geodesy import metres_per_degree_at, move_metres
 from amers.services.imagery.source import Window
+from amers.services.quality.correction_accuracy import CorrectionAccuracy
 from amers.services.sensors.correction import no_correction
 from amers.services.types import Array, Frame
 from tests.command_line import amers_here
@@ -198,13 +199,15 @@ def test_registered_models_bring_their_own_errors_and_those_of_the_control(
         registration = tmp_path / "registered" / name
         registration.mkdir(parents=True)
         text = format_correction(
-            no_correction(geometry.plan.shape),
+            CorrectionAccuracy(
+                no_correction(geometry.plan.shape),
+                np.diag([0.09, 0.0, 0.0, 0.09, 0.0, 0.0]),
+                np.zeros(2),
+                Frame.from_sigmas(2.0, 3.0),
+            ),
             "shift",
-            np.diag([0.09, 0.0, 0.0, 0.09, 0.0, 0.0]),
-            np.zeros(2),
             applies_to=f"{name}.tif",
             carried="approximately",
-            frame=Frame.from_sigmas(2.0, 3.0),
         )
         (registration / "correction.json").write_text(text)
     result = intersect_files(MarkedImages((file,), images(folder), registered=tmp_path / "registered"))

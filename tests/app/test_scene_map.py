@@ -22,6 +22,7 @@ from amers.app.usecases.scene_map import LAYERS, MappedScene, map_scene
 from amers.app.usecases.terrain_file import TerrainFile
 from amers.services.formats.sensor_models.correction_json import format_correction
 from amers.services.orthorectification.tile_limits import TILE_PX, TileLimits
+from amers.services.quality.correction_accuracy import CorrectionAccuracy
 from amers.services.sensors.correction import no_correction
 from amers.services.types import Array
 from tests.app.callers import Bearer, Caller
@@ -250,9 +251,8 @@ def drawn_on(terrain: TerrainFile | None, image: Path, folder: Path) -> tuple[Ma
     moved = replace(no_correction(shape), parameters=np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
     registration = folder / "registration"
     registration.mkdir(exist_ok=True)
-    text = format_correction(
-        moved, "shift", np.zeros((6, 6)), np.zeros(2), applies_to="tags", carried="tags"
-    )
+    stated = CorrectionAccuracy(moved, np.zeros((6, 6)), np.zeros(2))
+    text = format_correction(stated, "shift", applies_to="tags", carried="tags")
     (registration / "correction.json").write_text(text)
     lon, lat, height_m = (float(number) for number in MODEL.ground_offset)
     point = {"type": "Point", "coordinates": [lon, lat, height_m]}

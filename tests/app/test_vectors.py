@@ -19,6 +19,7 @@ from amers.services.formats.sensor_models.rpc_text import format_rpc_text
 from amers.services.formats.vector.layers import VectorLayer, read_layer, write_layer
 from amers.services.geodesy import metres_per_degree
 from amers.services.map_grid import xy_of_lon_lat
+from amers.services.quality.correction_accuracy import CorrectionAccuracy
 from amers.services.sensors.correction import no_correction
 from amers.services.sensors.rpc import RpcModel
 from amers.services.types import Frame
@@ -64,13 +65,12 @@ def registered(folder: Path, model: RpcModel, frame: Frame | None = None) -> Pat
     (folder / "refined_RPC.TXT").write_text(format_rpc_text(model))
     stated = {} if frame is None else {"frame": frame}
     text = format_correction(
-        no_correction((300, 400)),
+        CorrectionAccuracy(
+            no_correction((300, 400)), np.diag([1.0, 0, 0, 1.0, 0, 0]), np.zeros(2), **stated
+        ),
         "shift",
-        np.diag([1.0, 0, 0, 1.0, 0, 0]),
-        np.zeros(2),
         applies_to="tags",
         carried="refined_RPC.TXT",
-        **stated,
     )
     (folder / "correction.json").write_text(text)
     return folder

@@ -240,6 +240,7 @@ def write_registered(
         folder=folder,
         copy_image=copy_image,
         frame=registration.frame,
+        held=registration.qualification.coverage.outline,
     )
     report = build_report(
         registration,

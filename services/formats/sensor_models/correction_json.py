@@ -7,6 +7,7 @@ nodes, constant beyond them. The centre of the first pixel is (0, 0).
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +18,7 @@ from amers.services.formats.text_files import load_json
 from amers.services.quality.correction_accuracy import CorrectionAccuracy
 from amers.services.sensors.correction import ImageCorrection
 from amers.services.sensors.displacement import DisplacementGrid
-from amers.services.types import UNKNOWN_FRAME, Array, Frame
+from amers.services.types import Array, Frame
 
 CORRECTION_FORMAT = "amers-image-correction/1"
 PROFILE_FORMAT = "amers-image-correction/2"
@@ -32,35 +33,31 @@ _PROFILE = {
 }
 """Attributes of a profile, and the shape of each for a node."""
 
-_DECIMALS = 6
-"""Of the values at the nodes of a grid."""
+_DECIMALS, _HELD_DECIMALS = 6, 1
+"""Of the values at the nodes of a grid, and of an outline."""
 
 
 def format_correction(
-    correction: ImageCorrection,
+    stated: CorrectionAccuracy,
     order: str,
-    covariance_px2: Array,
-    local_sigma_px: Array,
     *,
     applies_to: str,
     carried: str,
-    frame: Frame = UNKNOWN_FRAME,
-    apart_px: float = 0.0,
+    held: Sequence[Array] | None = None,
 ) -> str:
     """The JSON document of a correction.
 
     Args:
-        correction: from positions of the delivered model to true positions.
+        stated: the correction, from positions of the delivered model to true ones, and its accuracy.
         order: "shift", "drift" or "affine".
-        covariance_px2: (6, 6) covariance of the parameters, row by row.
-        local_sigma_px: (2,) line and sample, of what parts of the image are off by beyond it.
         applies_to: one sentence on the origin of the delivered model.
         carried: one sentence on the files that contain the correction, and their accuracy.
-        frame: of the control points on the Earth.
-        apart_px: standard deviation of the offsets of the blocks of the points.
+        held: rings (n, 2) of line and sample of the area for which accuracy is stated, holes after the
+            rings around them; None where it is not known.
     """
+    correction = stated.correction
     grid = correction.displacement
-    document = {
+    document: dict[str, Any] = {
         "format": GRID_FORMAT if grid else CORRECTION_FORMAT,
         "applies_to": applies_to,
         "carried": carried,
@@ -72,10 +69,10 @@ def format_correction(
         "parameters_px": correction.parameters.tolist(),
         "centre_px": correction.centre.tolist(),
         "half_size_px": correction.half_size.tolist(),
-        "covariance_px2": _rows(covariance_px2),
-        "local_sigma_px": local_sigma_px.tolist(),
-        "frame_covariance_m2": _rows(frame.covariance_m2),
-        "apart_px": apart_px,
+        "covariance_px2": _rows(stated.covariance_px2),
+        "local_sigma_px": stated.local_sigma_px.tolist(),
+        "frame_covariance_m2": _rows(stated.frame.covariance_m2),
+        "apart_px": stated.apart_px,
     }
     if grid is not None:
         document["displacement"] = {
@@ -83,8 +80,24 @@ def format_correction(
             "sample": grid.sample.tolist(),
             "displacement_px": grid.displacement_px.round(_DECIMALS).tolist(),
             "variance_px2": grid.variance_px2.round(_DECIMALS).tolist(),
+            "position_variance_px2": _at_nodes(stated, grid),
         }
+    if held is not None:
+        document["held_outline_px"] = [ring.round(_HELD_DECIMALS).tolist() for ring in held]
     return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _at_nodes(stated: CorrectionAccuracy, grid: DisplacementGrid) -> list[Any]:
+    """Variance of a corrected position, line and sample, at each node: of all its errors together.
+
+    What the displacement adds to the variance of the parameters may be negative: both err together.
+    """
+    nodes = np.stack(np.meshgrid(grid.line, grid.sample, indexing="ij"), axis=-1)
+    covariance = stated.relative_px2(stated.correction.apply(nodes.reshape(-1, 2)))
+    variance = np.diagonal(covariance, axis1=1, axis2=2).round(_DECIMALS)
+    known = [[v if math.isfinite(v) else None for v in both] for both in variance.tolist()]
+    columns = len(grid.sample)
+    return [known[first : first + columns] for first in range(0, len(known), columns)]
 
 
 def parse_correction(text: str, source: str = "correction") -> ImageCorrection:

@@ -1,5 +1,6 @@
 """Files with the refined model of a registered scene, in the format of the delivered model."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,13 +19,14 @@ from amers.services.formats.sensor_models.rpc_files import (
 )
 from amers.services.map_grid import MapGrid
 from amers.services.misfit.scene_adjustment import SceneAdjustment
+from amers.services.quality.correction_accuracy import CorrectionAccuracy
 from amers.services.sensors.base import SensorModel
 from amers.services.sensors.correction import CorrectedModel
 from amers.services.sensors.moving_pushbroom import AttitudeMotion
 from amers.services.sensors.ortho import OrthoModel, fold_into_ortho
 from amers.services.sensors.refined import LOUD_PX, REFIT_LIMIT_PX, refined_rpc
 from amers.services.sensors.rpc import RpcModel
-from amers.services.types import UNKNOWN_FRAME, Frame
+from amers.services.types import UNKNOWN_FRAME, Array, Frame
 
 CORRECTION_JSON = "correction.json"
 FIT_LIMIT_PX = 0.1
@@ -76,6 +78,7 @@ def write_refined(
     folder: Path,
     copy_image: bool = False,
     frame: Frame = UNKNOWN_FRAME,
+    held: Sequence[Array] | None = None,
 ) -> RefinedFiles:
     """Write the refined model of a scene.
 
@@ -100,6 +103,7 @@ def write_refined(
         folder: where to write; created when missing.
         copy_image: also write a copy of a GeoTIFF with the refined model in its tags.
         frame: of the control points, for the errors of the model on the Earth.
+        held: rings of the area of the image for which accuracy is stated; see `format_correction`.
 
     Raises:
         FormatError: a delivered file would be overwritten.
@@ -110,15 +114,15 @@ def write_refined(
     if copied is not None and (folder / copied.name).resolve() != copied.resolve():
         (folder / copied.name).unlink(missing_ok=True)
     model_files, applies_to = _write_model(source, model, shape, folder, copied=copied)
-    text = format_correction(
+    stated = CorrectionAccuracy(
         adjustment.correction,
-        adjustment.order,
         adjustment.covariance,
         adjustment.local_sigma_px,
-        applies_to=applies_to,
-        carried=model_files.note,
-        frame=frame,
-        apart_px=adjustment.apart_px,
+        frame,
+        adjustment.apart_px,
+    )
+    text = format_correction(
+        stated, adjustment.order, applies_to=applies_to, carried=model_files.note, held=held
     )
     (folder / CORRECTION_JSON).write_text(text, encoding="utf-8")
     files = [folder / CORRECTION_JSON, *model_files.files]

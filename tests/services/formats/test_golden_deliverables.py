@@ -28,6 +28,7 @@ from amers.services.formats.sensor_models.dimap import format_dimap_rpc, parse_d
 from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
 from amers.services.formats.vector.residual_layers import write_residual_layers
 from amers.services.map_grid import MapGrid
+from amers.services.quality.correction_accuracy import CorrectionAccuracy
 from amers.services.reports.drawing import ACTIVE, DEACTIVATED, NOT_MATCHED
 from amers.services.sensors.correction import CorrectedModel
 from amers.services.sensors.ortho import OrthoModel
@@ -70,14 +71,16 @@ def test_a_written_correction_is_identical_to_the_byte() -> None:
     np.fill_diagonal(covariance, 0.25)
     document = json.loads(CORRECTION)
     again = format_correction(
-        correction,
+        CorrectionAccuracy(
+            correction,
+            covariance,
+            np.array([0.125, 0.0625]),
+            Frame(np.array([[4.0, 0.5, np.nan], [0.5, 9.0, np.nan], [np.nan] * 3])),
+            0.375,
+        ),
         "drift",
-        covariance,
-        np.array([0.125, 0.0625]),
         applies_to=document["applies_to"],
         carried=document["carried"],
-        frame=Frame(np.array([[4.0, 0.5, np.nan], [0.5, 9.0, np.nan], [np.nan] * 3])),
-        apart_px=0.375,
     )
     assert again == CORRECTION
     stated = parse_correction_accuracy(CORRECTION)

@@ -24,6 +24,7 @@ from amers.services.formats.sensor_models.refined_model import write_refined
 from amers.services.formats.sensor_models.rpc_files import ImageFiles
 from amers.services.formats.vector.residual_layers import exaggeration_for, write_residual_layers
 from amers.services.geodesy import metres_per_degree_at
+from amers.services.quality.correction_accuracy import CorrectionAccuracy
 from amers.services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
 from amers.services.sensors.displacement import DisplacementGrid
 from amers.services.sensors.refined import REFIT_LIMIT_PX, refined_rpc
@@ -39,9 +40,8 @@ CORRECTION = ImageCorrection(
 
 def written(correction: ImageCorrection = CORRECTION) -> str:
     covariance = np.diag([np.nan, 1, 2, 3, 4, 5])
-    return format_correction(
-        correction, "affine", covariance, np.zeros(2), applies_to="tags", carried="none"
-    )
+    stated = CorrectionAccuracy(correction, covariance, np.zeros(2))
+    return format_correction(stated, "affine", applies_to="tags", carried="none")
 
 
 def test_a_correction_survives_a_round_trip() -> None:
@@ -67,6 +67,35 @@ def test_a_correction_on_a_grid_survives_a_round_trip_in_its_own_format() -> Non
     for name in ("line", "sample", "displacement_px", "variance_px2"):
         np.testing.assert_array_equal(getattr(again, name), getattr(before, name))
     assert json.loads(written())["format"] == "amers-image-correction/1"
+
+
+def test_the_variance_of_a_position_at_a_node_is_one_whatever_the_displacement_adds() -> None:
+    """Parameters and displacement are uncertain by more than their sum: what it adds is negative."""
+    correction = on_grid()
+    grid = correction.displacement
+    assert grid is not None
+    less = replace(correction, displacement=replace(grid, variance_px2=np.full((3, 2, 2), -0.9)))
+    covariance, local_px = np.eye(6), np.array([0.1, 0.2])
+    document = json.loads(
+        format_correction(
+            CorrectionAccuracy(less, covariance, local_px), "affine", applies_to="tags", carried="none"
+        )
+    )["displacement"]
+    variance = np.array(document["position_variance_px2"])
+    assert variance.shape == (3, 2, 2)
+    assert (variance >= 0.0).all()
+    node = less.apply(np.array([[grid.line[1], grid.sample[0]]]))
+    expected = np.diagonal(less.covariance_at(node, covariance, local_px)[0])
+    np.testing.assert_allclose(variance[1, 0], expected, atol=1e-6)
+
+
+def test_the_area_that_points_hold_is_beside_the_correction() -> None:
+    ring = np.array([[0.0, 0.0], [0.0, 99.96], [50.0, 0.0], [0.0, 0.0]])
+    stated = CorrectionAccuracy(CORRECTION, np.eye(6), np.zeros(2))
+    text = format_correction(stated, "affine", applies_to="", carried="", held=[ring])
+    assert json.loads(text)["held_outline_px"] == [[[0.0, 0.0], [0.0, 100.0], [50.0, 0.0], [0.0, 0.0]]]
+    assert "held_outline_px" not in json.loads(written())
+    assert np.array_equal(parse_correction(text).parameters, CORRECTION.parameters)
 
 
 def by_line() -> dict[str, Any]:
