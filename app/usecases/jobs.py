@@ -44,6 +44,7 @@ from amers.app.usecases.blocks.ingestion import INGEST_BLOCK
 from amers.app.usecases.blocks.quality_job import ASSESS_BLOCK
 from amers.app.usecases.blocks.renewal_job import RENEW_BLOCK
 from amers.app.usecases.damage import report_damage
+from amers.app.usecases.mosaic_job import MAKE_MOSAIC
 from amers.app.usecases.orthorectification import ORTHORECTIFY
 from amers.app.usecases.processes import Process, Work, WorkFailed
 from amers.app.usecases.registration.job import REGISTER_SCENE
@@ -62,6 +63,7 @@ PROCESSES: dict[str, Process] = {
         MAP_SCENE,
         ORTHORECTIFY,
         MAKE_SURFACE,
+        MAKE_MOSAIC,
         CORRECT_VECTORS,
         PROJECT_VECTORS,
         INGEST_BLOCK,

@@ -12,13 +12,11 @@ from typing import Any
 from uuid import UUID
 
 from amers.app.auth import Scope
-from amers.app.db import registrations
 from amers.app.db.engine import Connection
-from amers.app.db.scenes import SceneRow
 from amers.app.db.tokens import Token
 from amers.app.errors import InputError
 from amers.app.usecases import quotas
-from amers.app.usecases.damage import named_by_row, suspecting_damage
+from amers.app.usecases.damage import suspecting_damage
 from amers.app.usecases.image_production import WorkPlace
 from amers.app.usecases.orthorectification import MapLimits, require_warranted_gsd
 from amers.app.usecases.processes import (
@@ -30,10 +28,8 @@ from amers.app.usecases.processes import (
     work_folder,
 )
 from amers.app.usecases.registered_scene import SceneModel, read_registered_scene
-from amers.app.usecases.registration.joint_job import MOST_SCENES
 from amers.app.usecases.results import store_results
-from amers.app.usecases.scene_inputs import check_scene, present_scene, registered_model_keys
-from amers.app.usecases.scenes import local_image, stored_keys
+from amers.app.usecases.stored_scenes import StoredScene, check_scenes, local_scene, stored_scenes
 from amers.app.usecases.surface import (
     SurfaceScene,
     refuse_ortho_image,
@@ -75,20 +71,7 @@ class MakeSurface:
     fill_cells: int = SurfaceOptions.fill_cells
 
 
-@dataclass(frozen=True)
-class _Stored:
-    """A scene and the keys of its registered model, none if the uploaded one is used."""
-
-    row: SceneRow
-    model: list[str]
-
-
 def _check(connection: Connection, caller: Token, inputs: MakeSurface) -> None:
-    if not 2 <= len(inputs.scenes) <= MOST_SCENES or len(set(inputs.scenes)) < len(inputs.scenes):
-        raise InputError(
-            f"scenes: {len(inputs.scenes)} given, {len(set(inputs.scenes))} of them different; 2 to "
-            f"{MOST_SCENES} different ones expected"
-        )
     if inputs.gsd_m is not None and not inputs.gsd_m > 0.0:
         raise InputError(f"gsd_m: {inputs.gsd_m:g} found, a length above 0 m expected")
     if inputs.heights_m is not None and not inputs.heights_m[0] < inputs.heights_m[1]:
@@ -98,45 +81,22 @@ def _check(connection: Connection, caller: Token, inputs: MakeSurface) -> None:
         raise InputError(f"pairs: {inputs.pairs} found, 1 to {MOST_PAIRS} expected")
     if not 0 <= inputs.fill_cells <= MOST_FILL_CELLS:
         raise InputError(f"fill_cells: {inputs.fill_cells} found, 0 to {MOST_FILL_CELLS} expected")
-    for scene in inputs.scenes:
-        check_scene(connection, caller, scene)
-    stored = _stored(connection, inputs)
+    check_scenes(connection, caller, inputs.scenes, fewest=2)
+    stored = stored_scenes(connection, inputs.scenes, inputs.registrations)
     known_m = [one.row.gsd_m for one in stored if one.row.gsd_m is not None]
     if inputs.gsd_m is not None and len(known_m) == len(stored):
         require_warranted_gsd(inputs.gsd_m, min(known_m))
-
-
-def _stored(connection: Connection, inputs: MakeSurface) -> list[_Stored]:
-    """The scenes of a job with the keys of their models.
-
-    Raises:
-        InputError: a scene was registered by none of the jobs.
-        Conflict: a scene or the results of a job were removed.
-    """
-    return [
-        _Stored(present_scene(connection, scene), _model_keys(connection, scene, inputs.registrations))
-        for scene in inputs.scenes
-    ]
-
-
-def _model_keys(connection: Connection, scene: UUID, jobs: tuple[UUID, ...]) -> list[str]:
-    if not jobs:
-        return []
-    for job in reversed(jobs):
-        if registrations.find_of_scene(connection, job, scene) is not None:
-            return registered_model_keys(connection, scene, job)
-    raise InputError(f"registrations: none of the jobs registered scene {scene}")
 
 
 def _run(work: Work) -> Commit:
     """Make the surface of uploaded scenes and put it into the storage."""
     inputs: MakeSurface = work.inputs
     with work.database.snapshot() as connection:
-        stored = _stored(connection, inputs)
+        stored = stored_scenes(connection, inputs.scenes, inputs.registrations)
         owner = work.job.owner
         room = None if owner is None else quotas.room_left(connection, work.settings, owner)
     options = SurfaceOptions(inputs.gsd_m, inputs.heights_m, inputs.pairs, fill_cells=inputs.fill_cells)
-    keys = [key for one in stored for key in (*stored_keys(one.row), *one.model)]
+    keys = [key for one in stored for key in one.keys]
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="amers-")))
         kept = stack.enter_context(work.storage.lasting_folder(work_folder(work.job.id)))
@@ -177,15 +137,10 @@ def _run(work: Work) -> Commit:
     return commit
 
 
-def _scene(work: Work, stored: _Stored, stack: ExitStack) -> SurfaceScene:
+def _scene(work: Work, stored: StoredScene, stack: ExitStack) -> SurfaceScene:
     """A scene with its model, open until the stack closes."""
     row = stored.row
-    scratch, folder = (Path(stack.enter_context(TemporaryDirectory(prefix="amers-"))) for _ in range(2))
-    image = local_image(work.storage, work.settings, row, scratch)
-    registration = None
-    for key in stored.model:
-        with named_by_row(key):
-            registration = work.storage.fetch(key, folder).parent
+    image, registration = local_scene(work, stored, stack)
     scene, _ = read_registered_scene(SceneModel(image, registration=registration))
     stack.callback(scene.image.close)  # type: ignore[attr-defined]
     refuse_ortho_image(scene, row.name)

@@ -113,6 +113,7 @@ def queue_jobs(dsn: str, made: Path) -> None:
             "view-scene": {"scene": raw},
             "map-scene": {"scene": flat, "registration": done["jobID"]},
             "orthorectify": on_ground,
+            "make-mosaic": {"scenes": pair, "gsd_m": 2.0, "height_m": 150.0},
             "make-surface": {"scenes": pair, "gsd_m": 2.0, "heights_m": [140.0, 180.0]},
             "correct-vectors": {**on_ground, "vectors": pixels.name, "sigma_m": SIGMA_M},
             "project-vectors": {**on_ground, "vectors": ground.name},

@@ -47,6 +47,7 @@ def inputs(admin: Caller) -> dict[str, dict[str, Any]]:
         "map-scene": {"scene": scene, "registration": scene},
         "orthorectify": {"scene": scene, "dem": "dem.tif"},
         "make-surface": {"scenes": [scene, other]},
+        "make-mosaic": {"scenes": [scene, other]},
         "correct-vectors": {"scene": scene, "vectors": "a.geojson", "dem": "dem.tif"},
         "project-vectors": {"scene": scene, "vectors": "a.geojson", "dem": "dem.tif"},
         "ingest-block": {"path": "block"},
