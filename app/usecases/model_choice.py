@@ -18,8 +18,9 @@ class ModelChoice:
     Attributes:
         model: file of the model; for one of several images IMAGE=FILE, repeat. By default the first of
             STEM.RPB, STEM.XML (WorldView), STEM_RPC.TXT, RPC_NAME.XML (DIMAP), STEM.rpc, tags of the
-            image, IMAGE.aux.xml, STEM_RPC.XML, STEM.geom, DIM_NAME.XML, METADATA.DIM, as in GDAL; for
-            JPEG 2000 IMAGE.aux.xml first, for NITF IMAGE.aux.xml, STEM_RPC.TXT and RPC00B first.
+            image, IMAGE.aux.xml, STEM_RPC.XML, STEM.geom, DIM_NAME.XML, METADATA.DIM, PHRDIMAP_NAME.XML,
+            as in GDAL; for JPEG 2000 IMAGE.aux.xml first, for NITF IMAGE.aux.xml, STEM_RPC.TXT and
+            RPC00B first.
         crop_origin: LINE,SAMPLE of the image's first pixel in the image that the model is for; 0,0 where
             they are the same; for one of several images IMAGE=LINE,SAMPLE, repeat. By default as stated
             by ICHIPB, .TIL, DIMAP or the geotransform.

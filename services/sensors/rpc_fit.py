@@ -4,10 +4,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from amers.services.errors import CoverageError
+from amers.services.errors import CoverageError, FormatError
 from amers.services.geodesy import longitudes_near
 from amers.services.sensors.base import SensorModel
-from amers.services.sensors.rpc import RpcModel, cubic_terms
+from amers.services.sensors.rpc import RpcModel, check_rpc, cubic_terms
 from amers.services.types import Array
 
 RIDGES = (1e-5, 1e-3, 1e-1)
@@ -55,7 +55,8 @@ def fit_rpc(model: SensorModel, shape: tuple[int, int], height_range_m: tuple[fl
     linear least squares. Each iteration is weighted by the denominator of the previous one and damped
     around its coefficients, so that the damping causes no bias. The first fit within `CLOSE_ENOUGH_PX`
     is returned: the grids of points and the dampings are tried in turn, the cheapest first. If none is
-    that close, the closest is returned.
+    that close, the closest is returned whose denominators do not vanish in its range; if all do, the
+    closest.
 
     Source: Tao and Hu (2001), "A comprehensive study of the rational function model".
 
@@ -79,7 +80,17 @@ def fit_rpc(model: SensorModel, shape: tuple[int, int], height_range_m: tuple[fl
             fits.append(RpcFit(fitted, float(error_px.max()), rms_px))
             if fits[-1].max_error_px < CLOSE_ENOUGH_PX:
                 return fits[-1]
-    return min(fits, key=lambda fit: fit.max_error_px)
+    closest = sorted(fits, key=lambda fit: fit.max_error_px)
+    return next((fit for fit in closest if _is_usable(fit.model)), closest[0])
+
+
+def _is_usable(model: RpcModel) -> bool:
+    """Whether readers accept an RPC; its range has corners beyond a turned image, without any point."""
+    try:
+        check_rpc(model, "fit")
+    except FormatError:
+        return False
+    return True
 
 
 @dataclass(frozen=True)

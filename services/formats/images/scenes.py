@@ -75,6 +75,8 @@ CE90_M = (
     ("PNEO", 5.0),
     ("SPOT6", 10.0),
     ("SPOT7", 10.0),
+    ("SPOT5", 75.0),
+    *((f"SPOT{number}", 530.0) for number in (1, 2, 3, 4)),
     ("WV", 5.0),
     ("GE01", 5.0),
     ("QB02", 21.0),
@@ -82,7 +84,9 @@ CE90_M = (
 """Horizontal accuracy without control points, by the start of the sensor's name, metres.
 
 Sources: Pléiades and Pléiades Neo, imagery user guides of Airbus Defence and Space (incidence up to 30
-degrees); SPOT 6/7, their technical sheet; WorldView and GeoEye, "better than 5 m CE90" of their
+degrees); SPOT 6/7, their technical sheet; SPOT 5, an attitude known to 6e-5 rad (ESA), 50 m rms; SPOT 1
+to 4, "300 to 500 metres (rms)" of Spot Image, taken as 350 m as Toutin and Carbonneau (1992) do, both
+for a circular normal law; WorldView and GeoEye, "better than 5 m CE90" of their
 operator; QuickBird, Smiley (2009), the worst quarter in two years.
 """
 
@@ -356,6 +360,8 @@ def _acquisition(image: SceneImage, delivered: DeliveredModel) -> Acquisition:
         acquisition = Acquisition(image_id, sensor, _imd_time(delivered.path))
     elif delivered.convention == "isd":
         acquisition = parse_isd_acquisition(read_text(delivered.path), image_id, delivered.path.name)
+    elif delivered.convention == "rigorous":
+        acquisition = _rigorous_acquisition(delivered.path, image_id)
     elif delivered.convention == "geom":
         acquisition = parse_geom_acquisition(read_text(delivered.path), image_id, delivered.path.name)
     if not acquisition.sensor:
@@ -432,6 +438,17 @@ def _dimap_acquisition(path: FilePlace, image_id: str) -> Acquisition:
         return of_rpc
     stated = parse_dimap_acquisition(read_text(product), image_id, product.name)
     return stated if stated.sensor else replace(stated, sensor=of_rpc.sensor)
+
+
+def _rigorous_acquisition(path: FilePlace, image_id: str) -> Acquisition:
+    """The acquisition in a document with a rigorous model; that of CNES names no satellite."""
+    text = read_text(path)
+    root = parse_xml(text, path.name)
+    if root.tag == "isd":
+        return parse_isd_acquisition(text, image_id, path.name)
+    if root.tag == "Dimap_Document":
+        return parse_dimap_acquisition(text, image_id, path.name)
+    return Acquisition(image_id, "PHR")
 
 
 def _central_view(model: RpcModel, shape: tuple[int, int]) -> tuple[float, float]:

@@ -164,8 +164,9 @@ def format_dimap_rpc(text: str, model: RpcModel, source: str = "DIMAP") -> str:
 def parse_dimap_acquisition(text: str, image_id: str, source: str = "DIMAP") -> Acquisition:
     """Sensor, time and sun of an image from the DIMAP document of its product, or of its RPC.
 
-    The document of the RPC has the sensor only. The sun angles are those of the image centre. Incidence
-    and azimuth stay unknown; they follow from the model.
+    The source of an image is a strip; in DIMAP 1, of SPOT 1 to 5, it is a scene. The document of the RPC
+    has the sensor only. The sun angles are those of the image centre. Incidence and azimuth stay
+    unknown; they follow from the model.
 
     Args:
         text: contents of the file.
@@ -178,15 +179,16 @@ def parse_dimap_acquisition(text: str, image_id: str, source: str = "DIMAP") -> 
     root = parse_xml(text, source)
     if root.tag != "Dimap_Document":
         raise FormatError(f"{source}: expected a DIMAP document, found <{root.tag[:60]}>")
-    mission = root.findtext(".//Strip_Source/MISSION", "").strip()
-    index = root.findtext(".//Strip_Source/MISSION_INDEX", "").strip()
+    source_of = ".//Strip_Source" if root.find(".//Strip_Source") is not None else ".//Scene_Source"
+    mission = root.findtext(f"{source_of}/MISSION", "").strip()
+    index = root.findtext(f"{source_of}/MISSION_INDEX", "").strip()
     profile = root.findtext(".//METADATA_PROFILE", "").split("_")[0].strip()
     return Acquisition(
         image_id=image_id,
         sensor=mission + index or _PROFILES.get(profile, ""),
         acquired_at=parse_imaging_time(
-            root.findtext(".//Strip_Source/IMAGING_DATE", ""),
-            root.findtext(".//Strip_Source/IMAGING_TIME", ""),
+            root.findtext(f"{source_of}/IMAGING_DATE", ""),
+            root.findtext(f"{source_of}/IMAGING_TIME", ""),
         ),
         sun_elevation_deg=_centre_angle(root, "SUN_ELEVATION"),
         sun_azimuth_deg=_centre_angle(root, "SUN_AZIMUTH"),

@@ -44,8 +44,8 @@ ORDER = {
 
 ORDER_FOR_PEOPLE = (
     "STEM.RPB, STEM.XML (WorldView), STEM_RPC.TXT, RPC_NAME.XML (DIMAP), STEM.rpc, tags of the image, "
-    "IMAGE.aux.xml, STEM_RPC.XML, STEM.geom, DIM_NAME.XML, METADATA.DIM; for JPEG 2000 IMAGE.aux.xml "
-    "first, for NITF IMAGE.aux.xml, STEM_RPC.TXT and RPC00B first"
+    "IMAGE.aux.xml, STEM_RPC.XML, STEM.geom, DIM_NAME.XML, METADATA.DIM, PHRDIMAP_NAME.XML; for JPEG "
+    "2000 IMAGE.aux.xml first, for NITF IMAGE.aux.xml, STEM_RPC.TXT and RPC00B first"
 )
 """As `--help` and documents state it."""
 
@@ -115,7 +115,11 @@ def names_of_models(image: SceneImage) -> dict[str, list[str]]:
         "other text": [f"{stem}.RPC.TXT", f"RPC_{stem}.TXT"],
         "other dimap": [f"{stem}_RPC.XML"],
         "geom": [f"{stem}.geom"],
-        "rigorous": [*document_names(stem), f"{stem}.DIM"],
+        "rigorous": [
+            *document_names(stem),
+            f"{stem}.DIM",
+            *(f"PHRDIMAP_{name}.XML" for name in [*airbus_names(stem), whole]),
+        ],
     }
 
 

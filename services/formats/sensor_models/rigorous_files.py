@@ -8,8 +8,8 @@ from amers.services.errors import FormatError
 from amers.services.formats.addresses import FilePlace
 from amers.services.formats.images.siblings import Siblings
 from amers.services.formats.images.tiled_image import SceneImage, TiledImage
+from amers.services.formats.sensor_models.model_order import names_of_models
 from amers.services.formats.sensor_models.place import stated_place
-from amers.services.formats.sensor_models.product_documents import airbus_names, document_names
 from amers.services.formats.sensor_models.rigorous_model import rigorous_model_in
 from amers.services.formats.text_files import read_text
 from amers.services.sensors.pushbroom import PushbroomModel
@@ -34,9 +34,9 @@ def rigorous_model_of_image(
 ) -> DeliveredRigorousModel | None:
     """The rigorous model in the metadata of an image; None where none of its files has one.
 
-    Looked at are, in this order: `model_path` and the `DIM_` file of its product; beside an image
-    `IMG_NAME` its `DIM_NAME.XML` and `RPC_NAME.XML`; `STEM.XML`, `STEM.DIM` and `STEM_RPC.XML`; and
-    `METADATA.DIM` for an image `IMAGERY`.
+    Looked at are `model_path` and the `DIM_` file of its product; else the XML files that have the name
+    of a model of the image, as `names_of_models` lists them for all models: the documents of products
+    first, then those of WorldView and of RPCs.
 
     Args:
         image: open.
@@ -63,12 +63,9 @@ def _metadata_of(image: SceneImage, model_path: Path | None) -> list[FilePlace]:
     if model_path is not None:
         product = model_path.with_name(re.sub("^RPC_", "DIM_", model_path.name, flags=re.IGNORECASE))
         return [path for path in dict.fromkeys([model_path, product]) if path.is_file()]
-    stem = image.path.stem
-    if isinstance(image, TiledImage):
-        return [image.path, *Siblings(image.path).named([f"{stem}.XML"])]
-    rpcs = [f"RPC_{name}.XML" for name in airbus_names(stem)]
-    names = [*document_names(stem), *rpcs, f"{stem}.XML", f"{stem}.DIM", f"{stem}_RPC.XML"]
-    return Siblings(image.path).named(names)
+    names = names_of_models(image)
+    kinds = ("rigorous", "airbus", "isd", "other dimap")
+    return Siblings(image.path).named([name for kind in kinds for name in names[kind]])
 
 
 def _in_pixels_of(
