@@ -163,10 +163,10 @@ class SemiGlobal:
 
 def seen_at(valid: BoolArray, disparity: FloatImage) -> BoolArray:
     """Whether the pixels that lie at disparities (rows, columns) in the other image are valid there."""
-    rows, columns = np.indices(disparity.shape)
-    at = columns - np.rint(np.nan_to_num(disparity)).astype(np.int64)
+    columns = np.arange(disparity.shape[1], dtype=np.int32)
+    at = columns - np.rint(np.nan_to_num(disparity)).astype(np.int32)
     inside = (at >= 0) & (at < valid.shape[1])
-    return np.asarray(inside & valid[rows, np.clip(at, 0, valid.shape[1] - 1)])
+    return inside & np.take_along_axis(valid, np.clip(at, 0, valid.shape[1] - 1), axis=1)
 
 
 _STEPS_PER_PX = 16
