@@ -1,5 +1,6 @@
 """Register a scene: read its files, find control, call the science, write the outcome."""
 
+import math
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -27,7 +28,7 @@ from amers.services.conventions import MAX_ERROR_SIGMAS
 from amers.services.errors import CoverageError
 from amers.services.formats.images.bands import parse_bands
 from amers.services.formats.images.scenes import read_scene, scene_name
-from amers.services.formats.sensor_models.refined_model import AdjustedRigorous, write_refined
+from amers.services.formats.sensor_models.refined_model import AdjustedRigorous, Stated, write_refined
 from amers.services.formats.sensor_models.rpc_files import ImageFiles
 from amers.services.geodesy import metres_per_degree
 from amers.services.imagery.scene import Scene, scene_footprint
@@ -239,8 +240,7 @@ def write_registered(
         shape=scene.image.shape,
         folder=folder,
         copy_image=copy_image,
-        frame=registration.frame,
-        held=registration.qualification.coverage.outline,
+        stated=_stated(registration),
     )
     report = build_report(
         registration,
@@ -254,6 +254,14 @@ def write_registered(
     outputs = write_outputs(folder, report, files.image.name, control.points, registration.model)
     outputs.update({path.name: path for path in refined.files})
     return RegisteredScene(registration, None, report, outputs)
+
+
+def _stated(registration: Registration) -> Stated:
+    """What a registration states of its correction; without any accuracy, no RPC misses it."""
+    quality = registration.qualification
+    worst_px = quality.predicted.worst_px
+    ce90_px = worst_px if np.isfinite(worst_px) else math.inf
+    return Stated(registration.frame, quality.coverage.outline, ce90_px)
 
 
 def record_registration(

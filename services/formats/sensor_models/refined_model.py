@@ -1,5 +1,6 @@
 """Files with the refined model of a registered scene, in the format of the delivered model."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,6 +70,22 @@ class RefinedFiles:
     note: str
 
 
+@dataclass(frozen=True)
+class Stated:
+    """What is stated of a correction beside its covariance.
+
+    Attributes:
+        frame: of the control points, for the errors of the model on the Earth.
+        held: rings of the area of the image for which accuracy is stated, see `format_correction`.
+        ce90_px: of the worst place there. An RPC that misses a displacement along lines and samples by
+            more is not written: it would be taken for what the verdict speaks of.
+    """
+
+    frame: Frame = UNKNOWN_FRAME
+    held: Sequence[Array] | None = None
+    ce90_px: float = math.inf
+
+
 def write_refined(
     source: ImageFiles,
     model: SensorModel | AdjustedRigorous,
@@ -77,8 +94,7 @@ def write_refined(
     shape: tuple[int, int],
     folder: Path,
     copy_image: bool = False,
-    frame: Frame = UNKNOWN_FRAME,
-    held: Sequence[Array] | None = None,
+    stated: Stated = Stated(),
 ) -> RefinedFiles:
     """Write the refined model of a scene.
 
@@ -102,8 +118,7 @@ def write_refined(
         shape: lines and samples of the image.
         folder: where to write; created when missing.
         copy_image: also write a copy of a GeoTIFF with the refined model in its tags.
-        frame: of the control points, for the errors of the model on the Earth.
-        held: rings of the area of the image for which accuracy is stated; see `format_correction`.
+        stated: of the correction beside its covariance.
 
     Raises:
         FormatError: a delivered file would be overwritten.
@@ -113,16 +128,18 @@ def write_refined(
     copied = image_path if copy_image and _is_geotiff(image_path) else None
     if copied is not None and (folder / copied.name).resolve() != copied.resolve():
         (folder / copied.name).unlink(missing_ok=True)
-    model_files, applies_to = _write_model(source, model, shape, folder, copied=copied)
-    stated = CorrectionAccuracy(
+    model_files, applies_to = _write_model(
+        source, model, shape, folder, copied=copied, stated_px=stated.ce90_px
+    )
+    accuracy = CorrectionAccuracy(
         adjustment.correction,
         adjustment.covariance,
         adjustment.local_sigma_px,
-        frame,
+        stated.frame,
         adjustment.apart_px,
     )
     text = format_correction(
-        stated, adjustment.order, applies_to=applies_to, carried=model_files.note, held=held
+        accuracy, adjustment.order, applies_to=applies_to, carried=model_files.note, held=stated.held
     )
     (folder / CORRECTION_JSON).write_text(text, encoding="utf-8")
     files = [folder / CORRECTION_JSON, *model_files.files]
@@ -139,6 +156,7 @@ def _write_model(
     folder: Path,
     *,
     copied: Path | None,
+    stated_px: float,
 ) -> tuple[RefinedFiles, str]:
     """The files of a refined model, and what a correction beside them applies to."""
     image_path = source.image
@@ -156,7 +174,7 @@ def _write_model(
         applies_to = f"map grid of {image_path.name}"
     else:
         delivered = read_rpc(*source) if isinstance(base, RpcModel) else None
-        model_files = _write_rpc(delivered, model, shape, folder, copied)
+        model_files = _write_rpc(delivered, model, shape, folder, copied, stated_px=stated_px)
         applies_to = delivered.note if delivered else f"model of {image_path.name}"
     return model_files, applies_to
 
@@ -167,8 +185,17 @@ def _write_rpc(
     shape: tuple[int, int],
     folder: Path,
     copied: Path | None,
+    *,
+    stated_px: float,
 ) -> RefinedFiles:
     refined = refined_rpc(model, shape)
+    if refined.max_error_px > max(stated_px, LOUD_PX):
+        note = (
+            f"no refined RPC is written: the nearest is up to {refined.max_error_px:.2g} px off, more "
+            f"than the CE90 of {stated_px:.2g} px that is stated; no RPC follows lines and samples so. "
+            f"Use {CORRECTION_JSON} with the delivered model, or an orthorectified image"
+        )
+        return RefinedFiles((), refined.max_error_px, note)
     if refined.model is None:
         note = (
             f"no RPC is within {REFIT_LIMIT_PX:g} px of the corrected model (the nearest differs by "

@@ -20,7 +20,7 @@ from amers.services.formats.sensor_models.correction_json import (
     parse_correction,
     parse_correction_accuracy,
 )
-from amers.services.formats.sensor_models.refined_model import write_refined
+from amers.services.formats.sensor_models.refined_model import Stated, write_refined
 from amers.services.formats.sensor_models.rpc_files import ImageFiles
 from amers.services.formats.vector.residual_layers import exaggeration_for, write_residual_layers
 from amers.services.geodesy import metres_per_degree_at
@@ -29,6 +29,7 @@ from amers.services.sensors.correction import CorrectedModel, ImageCorrection, n
 from amers.services.sensors.displacement import DisplacementGrid
 from amers.services.sensors.refined import REFIT_LIMIT_PX, refined_rpc
 from amers.services.simulation.orbit import pushbroom_over
+from tests.services.formats.statements.scene_files import CROP, write_image
 
 A_MICROMETRE = 1e-6
 CORRECTION = ImageCorrection(
@@ -272,3 +273,28 @@ def test_the_refined_model_of_an_ortho_scene_is_its_map_grid(registered, tmp_pat
     corner = np.array([[-0.5, -0.5]])
     placed = read_scene(tmp_path / "out" / "map.tif", sigma_m=10.0).model
     assert np.abs(placed.project(model.locate(corner, np.zeros(1))) - corner).max() < A_MICROMETRE
+
+
+@pytest.mark.parametrize(("stated_px", "written"), [(0.5, False), (20.0, True)])
+def test_an_rpc_that_misses_more_than_is_stated_is_not_written(
+    registered, tmp_path: Path, stated_px: float, written: bool
+) -> None:
+    """Twelve lines were repeated: the verdict is of the correction, and people take the RPC for it."""
+    image = write_image(tmp_path / "a.tif", CROP, shape=(400, 300))
+    line = np.array([0.0, 199.0, 200.0, 399.0])
+    step = np.zeros((4, 2, 2))
+    step[2:, :, 0] = 12.0
+    grid = DisplacementGrid(line, np.array([0.0, 299.0]), step, np.zeros((4, 2, 2)))
+    correction = replace(no_correction((400, 300)), displacement=grid)
+    model = CorrectedModel(CROP, correction)
+    adjustment = replace(registered().adjustment, correction=correction)
+    stated = Stated(ce90_px=stated_px)
+    left = write_refined(
+        ImageFiles(image), model, adjustment, shape=(400, 300), folder=tmp_path / "o", stated=stated
+    )
+    assert left.max_error_px > 2.0
+    names = {file.name for file in left.files}
+    assert ("refined_RPC.TXT" in names) == ("a_RPC.TXT" in names) == written
+    assert "correction.json" in names
+    assert ("OFF" if written else "no refined RPC is written") in left.note
+    assert {path.name for path in (tmp_path / "o").iterdir()} == names
