@@ -29,6 +29,11 @@ class MarkOptions:
         control_crs: reference system of x and y of a CSV, such as EPSG:32633.
         control_columns: columns of a CSV of other names: lon=COLUMN,lat=COLUMN,…
         control_sigma_axes: axes of the sigmas of an ASP file: ecef or lat-lon-height.
+        control_dem: heights of marks whose file has none, as that of QGIS: a file, or a folder or .txt
+            list of tiles.
+        control_dem_vertical: vertical datum of --control-dem: ellipsoid, EGM96, EGM2008, EPSG:…
+        control_dem_geoid: grid file of the geoid of --control-dem, GTX or GeoTIFF.
+        control_dem_sigma_m: sigma of its heights, metres; by default its own, or a tenth of its posting.
     """
 
     control: tuple[Path, ...] = ()
@@ -40,6 +45,10 @@ class MarkOptions:
     control_crs: str | None = None
     control_columns: str | None = None
     control_sigma_axes: str | None = None
+    control_dem: Path | None = None
+    control_dem_vertical: str | None = None
+    control_dem_geoid: GeoidFile = None
+    control_dem_sigma_m: FromMilli = None
 
     def files(self, of_many: bool = False) -> MarkFiles | None:
         """The files of the marks, with what the options state about them; None without any.
@@ -51,7 +60,16 @@ class MarkOptions:
             InputError: a value is wrong, or states something of a file that is not given.
         """
         if self.control:
-            return MarkFiles(self.control, _point_statements(self), of_many)
+            terrain = None
+            if self.control_dem is not None:
+                terrain = TerrainFile(
+                    self.control_dem,
+                    self.control_dem_vertical,
+                    self.control_dem_geoid,
+                    geoid_option="--control-dem-geoid",
+                )
+            statements = _point_statements(self)
+            return MarkFiles(self.control, statements, terrain, self.control_dem_sigma_m, of_many)
         alone = [
             option_name(field.name)
             for field in fields(self)

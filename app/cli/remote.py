@@ -94,6 +94,8 @@ def _inputs_of_marks(marks: MarkFiles) -> dict[str, Any]:
     points = marks.points
     if len(marks.paths) > 1:
         raise InputError(f"--control: {len(marks.paths)} files found; a service takes one of a scene")
+    if marks.terrain is not None:
+        raise InputError("--server: a service takes no --control-dem: state the heights of the marks")
     heights = points.stated.heights
     if isinstance(heights, Path) or points.stated.csv.crs or points.stated.csv.columns:
         raise InputError(

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
+from rasterio.transform import from_origin
 
 from amers.services.formats.images.raster import write_raster
 from amers.services.formats.sensor_models.rpc_files import read_rpc
@@ -169,3 +171,38 @@ def test_marks_of_several_scenes_are_told_apart_by_their_names(image):
     assert "other.csv: expected marks in view.tif, found marks in other" in ended.stderr
     document = json.loads((image.parent / "out" / "other" / "report.json").read_text())
     assert document["verdict"] == "usable"
+
+
+def test_marks_of_qgis_take_their_heights_from_a_terrain(image):
+    picked = np.array([[100.0, 120.0], [480.0, 700.0], [300.0, 90.0]])
+    ground = TRUE.locate(picked, np.full(3, 120.0))
+    rows = [
+        f"{lon:.10f},{lat:.10f},{sample + 0.5:.4f},{-(line + 0.5):.4f},1"
+        for (lon, lat, _), (line, sample) in zip(ground, picked, strict=True)
+    ]
+    points = image.with_name("view.points")
+    head = ["#CRS: EPSG:4326", "mapX,mapY,sourceX,sourceY,enable"]
+    points.write_text("\n".join([*head, *rows]) + "\n")
+    ended = register(image, "--control", points)
+    assert "3 of 3 points have no height" in ended.stderr
+    assert "--control-dem" in ended.stderr
+    dem = image.with_name("dem.tif")
+    west, north = ground[:, 0].min() - 0.01, ground[:, 1].max() + 0.01
+    with rasterio.open(
+        dem,
+        "w",
+        driver="GTiff",
+        height=60,
+        width=60,
+        count=1,
+        dtype="float32",
+        crs="EPSG:4326",
+        transform=from_origin(west, north, 0.0005, 0.0005),
+    ) as file:
+        file.write(np.full((1, 60, 60), 120.0, np.float32))
+    stated = ["--control-dem", dem, "--control-dem-vertical", "ellipsoid", "--control-dem-sigma-m", "2"]
+    ended = register(image, "--control", points, *stated)
+    assert ended.returncode == 0, ended.stderr
+    document = report(image)
+    assert document["correction"]["shift_px"] == pytest.approx(OFF_PX, abs=0.1)
+    assert [mark["sigma_m"][2] for mark in document["marks"]["marks"]] == pytest.approx([2.0] * 3)

@@ -99,6 +99,6 @@ def ground_positions(marks: MarkedPoints, path: Path, scene: Scene) -> Array:
     if missing.any() and not isinstance(scene.model, OrthoModel):
         raise InputError(
             f"{path.name}: {int(missing.sum())} of {len(marks)} points have no height; a scene that is "
-            "not an ortho-image needs heights"
+            "not an ortho-image needs heights (--control takes them from --control-dem)"
         )
     return np.nan_to_num(marks.lon_lat_h, nan=0.0)

@@ -11,6 +11,7 @@ import numpy as np
 from amers.app.errors import InputError
 from amers.app.usecases.marked_files import PointStatements
 from amers.app.usecases.registration.check_points import ground_positions, marks_in_image
+from amers.app.usecases.terrain_file import TerrainFile, read_terrain
 from amers.services.datums import filled_sigmas
 from amers.services.errors import refuse_unstated
 from amers.services.formats.gcp.marked_points import MarkedPoints
@@ -29,12 +30,16 @@ class MarkFiles:
     Attributes:
         paths: of the files, one at least.
         points: heights, sigmas and frame, where the files state none.
+        terrain: heights of marks whose file has none, as that of QGIS; None for none.
+        terrain_sigma_m: one standard deviation of these heights; None for that of the terrain.
         of_many: whether they are of several scenes: marks that name no image are then in the one that
             their file is named like.
     """
 
     paths: tuple[Path, ...]
     points: PointStatements = field(default_factory=PointStatements)
+    terrain: TerrainFile | None = None
+    terrain_sigma_m: float | None = None
     of_many: bool = False
 
     @property
@@ -76,7 +81,10 @@ def read_control_marks(files: MarkFiles, image: Path, scene: Scene) -> MarksOfSc
             marks = replace(marks, image=np.where(marks.image == "", path.stem, marks.image))
         read.append((path, marks.take(marks.is_marked)))
     refuse_unstated(unstated)
-    parts = [_completed(marks, path, files.points, image, scene) for path, marks in read]
+    parts = [
+        _on_terrain(_completed(marks, path, files.points, image, scene), path, files)
+        for path, marks in read
+    ]
     several = len(parts) > 1
     names = [
         f"{path.name}:{name}" if several else name
@@ -156,6 +164,32 @@ def _completed(
     return replace(
         taken, sigma_m=sigma_m, sigma_px=sigma_px, statements=(*taken.statements, *statements)
     )
+
+
+def _on_terrain(marks: MarkedPoints, path: Path, files: MarkFiles) -> MarkedPoints:
+    """The marks of a file with heights of the terrain where it states none.
+
+    What a mark is off by on the map moves its height on a slope.
+    """
+    missing = np.flatnonzero(np.isnan(marks.lon_lat_h[:, 2]))
+    if files.terrain is None or not len(missing):
+        return marks
+    terrain = read_terrain(files.terrain, files.terrain_sigma_m)
+    lon_lat_h, sigma_m = marks.lon_lat_h.copy(), marks.sigma_m.copy()
+    place = lon_lat_h[missing, :2]
+    lon_lat_h[missing, 2] = terrain.height_m(place)
+    void = missing[np.isnan(lon_lat_h[missing, 2])]
+    if len(void):
+        raise InputError(
+            f"{path.name}, point {marks.id[void[0]]}: {files.terrain.dem.name} has no height there "
+            f"({len(void)} of {len(missing)} points without one); give a terrain that covers the marks"
+        )
+    on_slope_m2 = ((np.nan_to_num(terrain.slope(place)) * sigma_m[missing, :2]) ** 2).sum(axis=1)
+    sigma_m[missing, 2] = np.sqrt(terrain.sigma_m(place) ** 2 + on_slope_m2)
+    value = f"{len(missing)} heights of {files.terrain.dem.name}"
+    used = Statement(path.name, Subject.VERTICAL_DATUM, Use.USED, value, "heights of the marks")
+    statements = (*marks.statements, *terrain.statements, used)
+    return replace(marks, lon_lat_h=lon_lat_h, sigma_m=sigma_m, statements=statements)
 
 
 def _refuse_twice(names: Sequence[str], files: MarkFiles) -> None:
