@@ -177,8 +177,17 @@ def _of_elsewhere(scene: AdjustedScene, held: HeldArea) -> Finding:
     among = int(held.holds(expected[group.rows]).sum())
     share = among / max(among + int(scene.measures.active.sum()), 1)
     harm_px = np.sqrt(share) * np.abs(group.displacement_px) / np.sqrt(2.0)
-    words = elsewhere_words(group, expected, scene.measures.active)
+    parts = [one for one in scene.pixel_findings if one.kind == Fault.PART]
+    shown = any(_inside_part(one, expected[group.rows]) for one in parts)
+    words = elsewhere_words(group, expected, scene.measures.active, in_part=shown)
     return Finding("points_elsewhere", harm_px, words)
+
+
+def _inside_part(part: PixelFinding, line_sample: Array) -> bool:
+    """Whether most places (n, 2) lie in a part of another image that the pixels show."""
+    first = np.array([part.line, part.sample])
+    within = (line_sample >= first) & (line_sample <= first + [part.lines, part.samples])
+    return bool(within.all(axis=1).mean() > 0.5)
 
 
 def _held(scene: AdjustedScene) -> HeldArea:

@@ -80,10 +80,11 @@ class HeldArea:
     @property
     def outline(self) -> BaseGeometry:
         """The area as polygons, x samples and y lines, pixels from the middle of the first."""
-        height, width = (size / _CELLS for size in self.shape)
         row, column = np.nonzero(self.cells)
-        left, top = column * width - 0.5, row * height - 0.5
-        return shapely.union_all(shapely.box(left, top, left + width, top + height)).simplify(0.0)
+        # Whole numbers meet exactly, as parts of pixels would not.
+        cells = shapely.union_all(shapely.box(column, row, column + 1, row + 1)).simplify(0.0)
+        size = np.array(self.shape)[::-1] / _CELLS
+        return shapely.transform(cells, lambda xy: xy * size - 0.5)
 
     @property
     def rings(self) -> tuple[Array, ...]:

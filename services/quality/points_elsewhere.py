@@ -67,13 +67,16 @@ def agree_elsewhere(
     return out
 
 
-def elsewhere_words(group: Elsewhere, expected: Array, active: BoolArray) -> str:
+def elsewhere_words(
+    group: Elsewhere, expected: Array, active: BoolArray, *, in_part: bool = False
+) -> str:
     """What was seen of a group of points, and what the places of the others say of its cause.
 
     Args:
         group: points that agree elsewhere.
         expected: (n, 2) line and sample where the scene places all points.
         active: (n,) points that agree with the scene.
+        in_part: whether the pixels show a part of another image there.
     """
     some, others = expected[group.rows], expected[active]
     first, last = some.min(axis=0), some.max(axis=0)
@@ -84,6 +87,8 @@ def elsewhere_words(group: Elsewhere, expected: Array, active: BoolArray) -> str
         f"{group.displacement_px[1]:+.1f} samples; {group.false_alarms:.1g} such groups expected by "
         "chance)"
     )
+    if in_part:
+        return f"{seen}. The pixels show a part of another image there"
     return f"{seen}. {_cause(some, others, group.displacement_px)}"
 
 

@@ -121,3 +121,10 @@ def test_points_that_lie_within_the_scatter_of_the_others_are_not_elsewhere() ->
     assert agree_elsewhere(expected, 2.0 * near, np.ones(50, dtype=bool), 1.0).all()
     alone = np.arange(50) == 7
     assert not agree_elsewhere(expected, 9.0 * near, alone, 1.0).any()
+
+
+def test_a_part_that_the_pixels_show_is_the_cause(others: np.ndarray) -> None:
+    line_sample = np.column_stack([np.concatenate([others[:4], others]), np.linspace(0.0, 999.0, 44)])
+    group = Elsewhere(np.arange(4), np.array([4.0, -6.0]), 5.0, 1e-9)
+    words = elsewhere_words(group, line_sample, np.arange(44) >= 4, in_part=True)
+    assert words.endswith("The pixels show a part of another image there")
