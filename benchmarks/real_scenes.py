@@ -22,6 +22,7 @@ import numpy as np
 from amers.services.imagery.scene import Scene, scene_gsd_m
 from amers.services.imagery.source import ArrayImage, Window
 from amers.services.matching.predict import in_image
+from amers.services.registration.on_points import Registration
 from benchmarks._campaign import Log, fingerprint, run_campaign
 from benchmarks._faulty_pixels import KINDS, Fault, drawn_fault
 from benchmarks._measuring import RESULTS, print_table
@@ -38,6 +39,8 @@ FAULTS_OF_VIEW = 5
 DATES = {pair.name: pair for pair in PAIRS}
 UNJUDGED = "no truth"
 VERDICTS = ("good", "usable", "failed", "refused", UNJUDGED)
+_BESIDE_PX = 30.0
+"""How far crops reach beyond the points of their view."""
 _KEY = 43
 
 
@@ -84,13 +87,16 @@ def faulty_trials() -> list[RealTrial]:
     return out
 
 
-def register_trial(trial: RealTrial, view: RealView):  # type: ignore[no-untyped-def]
+def register_trial(trial: RealTrial, view: RealView) -> tuple[Outcome, Registration | None]:
     """The outcome of a scene, and its registration."""
     rng = np.random.default_rng([SEED, trial.number, len(trial.view), sum(map(ord, trial.view)), _KEY])
     shape = view.scene.image.shape
     corner = np.zeros(2)
     if trial.number:
-        corner = np.floor(rng.uniform(0.0, np.maximum(np.array(shape) - view.crop, 0.0)))
+        # Around the points: views have borders without pixels.
+        first = np.clip(view.placed.min(axis=0) - _BESIDE_PX, 0.0, None)
+        last = np.minimum(view.placed.max(axis=0) + _BESIDE_PX, shape) - view.crop
+        corner = np.floor(rng.uniform(first, np.maximum(first, last)))
         shape = (min(view.crop, shape[0]), min(view.crop, shape[1]))
     window = Window(int(corner[0]), int(corner[1]), *shape)
     pixels = trial.fault.pixels(view.scene.image.read(window))
