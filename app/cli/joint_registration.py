@@ -18,7 +18,13 @@ from amers.app.db.engine import Database
 from amers.app.errors import AmersError, ComputationError, InputError
 from amers.app.usecases import storage_identity
 from amers.app.usecases.executors import ComputeOptions
-from amers.app.usecases.registration.control_sources import FindPoints, points_of_block, points_of_store
+from amers.app.usecases.registration.control_marks import MarkFiles
+from amers.app.usecases.registration.control_sources import (
+    FindPoints,
+    no_points,
+    points_of_block,
+    points_of_store,
+)
 from amers.app.usecases.registration.joined_scenes import read_joined
 from amers.app.usecases.registration.register import SceneFiles, image_key, record_registration
 from amers.app.usecases.registration.result_folder import older_result, replacing
@@ -41,7 +47,8 @@ class JointRequest:
     Attributes:
         files: of the scenes.
         output: folder of the folders of the results.
-        block: folder of a block of control points; None for the store.
+        block: folder of a block of control points; None for the store, or for marks alone.
+        marks: of a person in the scenes; None for none.
         joined: folder of results that these scenes join.
         copy_image: also copy GeoTIFFs, with the refined models in their tags.
         max_ce90_on_earth_m: see `QualificationOptions`.
@@ -51,6 +58,7 @@ class JointRequest:
     files: Sequence[SceneFiles]
     output: Path
     block: Path | None
+    marks: MarkFiles | None
     joined: Path | None
     copy_image: bool
     max_ce90_on_earth_m: float | None
@@ -74,6 +82,8 @@ class JointRequest:
         }
         words = [str(one.image) for one in self.files]
         words += [str(word) for pair in named.items() if pair[1] is not None for word in pair]
+        if self.marks is not None:
+            words += [word for path in self.marks.paths for word in ("--control", str(path))]
         return shlex.join(["amers", "scene", "register-many", *words])
 
     def scene(self, files: SceneFiles) -> SceneRequest:
@@ -143,6 +153,9 @@ def _control(request: JointRequest) -> Iterator[tuple[FindPoints, Database | Non
     if request.block is not None:
         yield points_of_block(request.block), None
         return
+    if request.marks is not None:
+        yield no_points, None
+        return
     settings = read_settings()
     with engine.opened(settings) as database:
         yield points_of_store(database, storage_identity.opened(database, settings)), database
@@ -159,6 +172,7 @@ def _run(request: JointRequest, find_points: FindPoints, folders: dict[str, Path
                 ComputeOptions(jobs=request.jobs),
                 None if request.joined is None else read_joined(request.joined / BLOCK_FOLDER),
             ),
+            marks=request.marks,
             options=request.options,
             copy_image=request.copy_image,
             progress=progress,

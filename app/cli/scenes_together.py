@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from amers.app.cli.control_options import MarkOptions
 from amers.app.cli.joint_registration import JointRequest, register_together
 from amers.app.cli.options import FromCenti, FromMilli
 from amers.app.cli.output import AsJson, print_json, show_one
@@ -51,6 +52,7 @@ def register_many(
     *,
     models: ModelChoice,
     options: JointOptions,
+    marks: MarkOptions,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Folder; each scene gets one inside it.")
     ] = Path("registered"),
@@ -61,7 +63,7 @@ def register_many(
 
     Scenes with few control points are held by their neighbours. One that does not fit is named and left
     out. The folder OUTPUT/block holds the report on all scenes. The points come from the store unless
-    --block is given.
+    --block or --control is given.
     """
     rigorous = options.rigorous
     if rigorous is not None:
@@ -77,6 +79,7 @@ def register_many(
         ],
         output=output,
         block=options.block,
+        marks=marks.files(of_many=len(images) > 1),
         joined=options.join,
         copy_image=options.copy_image,
         max_ce90_on_earth_m=options.max_ce90_on_earth_m,

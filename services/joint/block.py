@@ -271,6 +271,7 @@ def _control(
         source=block,
         frames=_frames(scenes, block),
         names=tuple(str(one) for one in identity[index]),
+        by_hand=identity[index] < 0,
     )
     found = Observations(
         first + place[order],

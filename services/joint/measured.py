@@ -1,10 +1,12 @@
 """The control points as measured in a scene, before it is adjusted together with others."""
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from amers.services.errors import ComputationError
 from amers.services.imagery.scene import Scene
 from amers.services.matching.control_points import PointMatches
 from amers.services.misfit.control_observations import ControlObservations
@@ -12,7 +14,8 @@ from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.quality.points_elsewhere import Elsewhere
 from amers.services.registration.context import SearchStage
 from amers.services.registration.options import RegistrationOptions
-from amers.services.registration.search import Search, control_observations
+from amers.services.registration.scene_marks import SceneMarks, searched_with_marks, with_marks
+from amers.services.registration.search import Search, adjust_search, control_observations
 from amers.services.sensors.correction import ImageCorrection
 from amers.services.sensors.displacement import DisplacementGrid
 from amers.services.sensors.moving_pushbroom import moving_model
@@ -31,6 +34,7 @@ class MeasuredScene:
         alone: the adjustment of this scene on its own control points; None where they do not allow one.
         stages: summaries of the searches.
         elsewhere: points that agree on another place; None without any.
+        marks: of a person in it, which are the last points; None without any in all scenes.
     """
 
     scene: Scene
@@ -39,6 +43,7 @@ class MeasuredScene:
     alone: SceneAdjustment | None
     stages: tuple[SearchStage, ...] = ()
     elsewhere: Elsewhere | None = None
+    marks: SceneMarks | None = None
 
     @property
     def name(self) -> str:
@@ -100,6 +105,26 @@ class MeasuredScene:
         place = self.scene.model.project(seen.lon_lat_h)
         shown = displacement.averaged(place, seen.chip_side_px)
         return np.asarray(seen.line_sample + displacement.at(place) - shown)
+
+
+def with_own_marks(
+    measured: MeasuredScene, marks: SceneMarks, options: RegistrationOptions
+) -> MeasuredScene:
+    """A measured scene with marks of a person in it, which may be none: all scenes need their frame."""
+    points = with_marks(measured.points, marks)
+    search = searched_with_marks(measured.search, len(measured.points), marks)
+    alone = measured.alone
+    if len(marks):
+        adjustment = options_in_block(options).adjustment
+        with suppress(ComputationError):
+            alone = adjust_search(measured.scene, search, adjustment, ground_may_move=True)
+    return replace(measured, points=points, search=search, alone=alone, marks=marks)
+
+
+def without_own_marks(measured: MeasuredScene) -> MeasuredScene:
+    """The scene with the points of the base alone, which can be searched."""
+    points = measured.points.take(np.flatnonzero(measured.points.id >= 0))
+    return replace(measured, points=replace(points, frames=points.frames[:-1]), marks=None)
 
 
 def options_in_block(options: RegistrationOptions) -> RegistrationOptions:

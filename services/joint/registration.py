@@ -14,7 +14,13 @@ from amers.services.imagery.scene import Scene, with_pixel_findings
 from amers.services.imagery.source import CachedImage, image_gsds_m
 from amers.services.joint.block import JointBlock, repeated
 from amers.services.joint.fitting import Left, SceneFit, adjust_fitting, scene_fit, ties_between
-from amers.services.joint.measured import MeasuredScene, nothing_found, options_in_block
+from amers.services.joint.measured import (
+    MeasuredScene,
+    nothing_found,
+    options_in_block,
+    with_own_marks,
+    without_own_marks,
+)
 from amers.services.joint.results import (
     RigorousScene,
     held_cells,
@@ -33,6 +39,7 @@ from amers.services.registration.elsewhere import adjust_with_places
 from amers.services.registration.on_points import Registration, search_near, search_scene
 from amers.services.registration.options import RegistrationOptions
 from amers.services.registration.point_selection import initial_prediction, points_to_try, visible_points
+from amers.services.registration.scene_marks import SceneMarks
 from amers.services.registration.search import adjust_search
 from amers.services.sensors.correction import CorrectedModel, no_correction
 from amers.services.sensors.pushbroom import PushbroomModel
@@ -90,6 +97,7 @@ def register_together(
     chips: ChipSource,
     options: RegistrationOptions = RegistrationOptions(),
     *,
+    marks: Sequence[SceneMarks] | None = None,
     joined: AdjustedScenes | None = None,
     work: Work | None = None,
     progress: Progress = no_progress,
@@ -105,6 +113,7 @@ def register_together(
         points: of the ground of all scenes.
         chips: of the points.
         options: of the searches, of the corrections and of the qualification.
+        marks: of a person, for each scene; they may be none, and share one frame. None for no marks.
         joined: scenes that were adjusted before; they stay as they are.
         work: computes the searches and the tie points; by default in this process.
         progress: receives the fraction done.
@@ -120,6 +129,9 @@ def register_together(
     measured = [nothing_found(scene, points.take(np.zeros(0, dtype=np.int64))) for scene in before]
     searching = partial(measure_scene, points=points, chips=chips, options=options)
     measured += _measure_all(scenes, searching, work, part_of(progress, 0.0, 0.4))
+    if marks is not None:
+        every = [*(marks[0].take(np.zeros(0, dtype=np.int64)) for _ in before), *marks]
+        measured = [with_own_marks(one, own, options) for one, own in zip(measured, every, strict=True)]
     ties = _ties(measured, work, part_of(progress, 0.4, 0.3))
     progress(0.7, "adjusting the scenes together")
     again = part_of(progress, 0.72, 0.08)
@@ -234,7 +246,8 @@ def _searched_again(
     """Scenes that their own points did not place, searched around where the block expects points."""
     again = {}
     for number, measured in enumerate(block.scenes):
-        shown, scene = measured.points, measured.scene
+        own = measured.marks
+        shown, scene = (measured if own is None else without_own_marks(measured)).points, measured.scene
         if measured.alone is not None or not len(shown):
             continue
         model = block.model(number)
@@ -257,9 +270,8 @@ def _searched_again(
         with suppress(ComputationError):
             alone = adjust_search(scene, search, context.options.adjustment, ground_may_move=True)
             search, alone, elsewhere = adjust_with_places(context, search, alone)
-        again[measured.name] = MeasuredScene(
-            scene, shown, search, alone, tuple(context.stages), elsewhere
-        )
+        found = MeasuredScene(scene, shown, search, alone, tuple(context.stages), elsewhere)
+        again[measured.name] = found if own is None else with_own_marks(found, own, options)
     return again
 
 

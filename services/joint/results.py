@@ -25,6 +25,7 @@ from amers.services.misfit.structure import unfollowed_variance_px2
 from amers.services.quality.cell_stability import cell_stability_of, cells_of
 from amers.services.quality.findings import with_findings
 from amers.services.quality.frames import shared_frame, weighted_frame
+from amers.services.quality.marks import marks_beside_points
 from amers.services.quality.qualification import QualificationOptions, qualify_repeated
 from amers.services.quality.stability import AdjustedScene, Repetition, stability_of
 from amers.services.registration.on_points import Registration
@@ -212,7 +213,7 @@ def registered_scene(
         cell_stability_of(scene, of_cells),
         tie_residual_px=tie_residual_px(block, number),
     )
-    views = measured.search.matches.view_measures
+    views, marks = measured.search.matches.view_measures, measured.marks
     return Registration(
         scene.model,
         scene.adjustment,
@@ -221,6 +222,9 @@ def registered_scene(
         measured.stages,
         scene.frame,
         qualification,
+        None
+        if marks is None or not len(marks)
+        else marks_beside_points(scene, marks.names, marks.sigma_m),
     )
 
 

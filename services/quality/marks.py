@@ -179,8 +179,13 @@ def marks_beside_points(scene: AdjustedScene, names: Sequence[str], sigma_m: Arr
 
 
 def _without_each(scene: AdjustedScene, rows: IntArray) -> Array:
-    """Misfit (n, 2) of measures at some rows (n,) against the adjustment without each of them."""
+    """Misfit (n, 2) of measures at some rows (n,) against the adjustment without each of them.
+
+    That of a rejected one is its residual; in a block of many scenes the others are not known.
+    """
     left_out_px = scene.measures.residual_px[rows].copy()
+    if scene.refit is None:
+        left_out_px[scene.measures.active[rows]] = np.nan
     for number, row in enumerate(rows.tolist()):
         if not scene.measures.active[row] or scene.refit is None:
             continue

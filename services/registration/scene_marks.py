@@ -10,7 +10,9 @@ from amers.services.misfit.scene_adjustment import AdjustmentOptions, SceneAdjus
 from amers.services.registration.search import Search, adjust_search
 from amers.services.statements import Statements
 from amers.services.types import (
+    UNKNOWN_FRAME,
     Array,
+    BoolArray,
     ChipArray,
     ControlPoints,
     Frame,
@@ -33,6 +35,8 @@ class SceneMarks:
         sigma_px: (n,) of the picks, each coordinate.
         frame: error on the Earth that all of them share.
         statements: of their files.
+        number: (n,) int64, identities of the marks as control points, below 0, where several scenes show
+            the same ground; None for -1, -2 and so on.
     """
 
     names: tuple[str, ...]
@@ -42,6 +46,7 @@ class SceneMarks:
     sigma_px: Array
     frame: Frame
     statements: Statements = ()
+    number: IntArray | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -53,8 +58,17 @@ class SceneMarks:
 
     @property
     def numbers(self) -> IntArray:
-        """Identities (n,) of the marks as control points: -1, -2 and so on, which no base has."""
-        return -np.arange(1, len(self) + 1)
+        """Identities (n,) of the marks as control points, which no base has."""
+        return -np.arange(1, len(self) + 1) if self.number is None else self.number
+
+    def take(self, rows: IntArray | BoolArray) -> "SceneMarks":
+        """Some of the marks."""
+        columns = {
+            name: getattr(self, name)[rows]
+            for name in ("lon_lat_h", "line_sample", "sigma_m", "sigma_px")
+        }
+        names = tuple(np.array(self.names, dtype=np.str_)[rows].tolist())
+        return replace(self, names=names, number=self.numbers[rows], **columns)
 
     @property
     def points(self) -> ControlPoints:
@@ -75,6 +89,11 @@ class SceneMarks:
             chip_row=zeros,
             chip_files=(),
         )
+
+
+NO_MARKS = SceneMarks(
+    (), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0), UNKNOWN_FRAME
+)
 
 
 class NoChips:
@@ -130,6 +149,13 @@ def adjust_with_marks(
         marks: in the scene.
         options: of the adjustment.
     """
+    search = searched_with_marks(search, len(points), marks)
+    adjustment = adjust_search(scene, search, options, ground_may_move=True)
+    return with_marks(points, marks), search, adjustment
+
+
+def searched_with_marks(search: Search, count: int, marks: SceneMarks) -> Search:
+    """A search with marks as points that were found; they stand behind all `count` points."""
     n, matches = len(marks), search.matches
     strips = matches.strips
     if strips is not None:
@@ -151,12 +177,10 @@ def adjust_with_marks(
         by_gradient=np.concatenate([matches.by_gradient, np.zeros(n, dtype=np.bool_)]),
         strips=strips,
     )
-    search = replace(
+    return replace(
         search,
         points=with_marks(search.points, marks),
-        rows=np.concatenate([search.rows, len(points) + np.arange(n)]),
+        rows=np.concatenate([search.rows, count + np.arange(n)]),
         matches=matches,
         inliers=np.concatenate([search.inliers, np.ones(n, dtype=np.bool_)]),
     )
-    adjustment = adjust_search(scene, search, options, ground_may_move=True)
-    return with_marks(points, marks), search, adjustment

@@ -61,13 +61,16 @@ class MarksOfScene:
     check: CheckPoints | None
 
 
-def read_control_marks(files: MarkFiles, image: Path, scene: Scene) -> MarksOfScene:
+def read_control_marks(
+    files: MarkFiles, image: Path, scene: Scene, *, may_lack: bool = False
+) -> MarksOfScene:
     """The marks of a scene. A sigma that nobody states is assumed, and stated as such.
 
     Args:
         files: of the marks; marks in other images are not used.
         image: of the scene.
         scene: of the image; needs no heights if it is an ortho-image.
+        may_lack: whether the image may have no mark, as one of many.
 
     Raises:
         InputError: a file cannot be used, does not state its heights, or has no mark of this scene; all
@@ -79,11 +82,16 @@ def read_control_marks(files: MarkFiles, image: Path, scene: Scene) -> MarksOfSc
         unstated += missing
         if files.of_many:
             marks = replace(marks, image=np.where(marks.image == "", path.stem, marks.image))
-        read.append((path, marks.take(marks.is_marked)))
+        marks = marks.take(marks.is_marked)
+        if len(marks) == 0:
+            raise InputError(f"{path.name}: none of its marks is switched on; switch some on")
+        read.append((path, marks))
     refuse_unstated(unstated)
     parts = [
         _on_terrain(_completed(marks, path, files.points, image, scene), path, files)
-        for path, marks in read
+        for path, marks in (
+            (path, _of_image(marks, image) if may_lack else marks) for path, marks in read
+        )
     ]
     several = len(parts) > 1
     names = [
@@ -99,7 +107,7 @@ def read_control_marks(files: MarkFiles, image: Path, scene: Scene) -> MarksOfSc
         np.concatenate([getattr(part, column) for part in parts])
         for column in ("line_sample", "sigma_m", "sigma_px", "check")
     )
-    if check.all():
+    if check.all() and not may_lack:
         raise InputError(
             f"{files.name}: all {len(check)} marks are check points, none is left to register the scene "
             "on; switch the flag of some off, or give the file as --check-points"
@@ -123,13 +131,34 @@ def read_control_marks(files: MarkFiles, image: Path, scene: Scene) -> MarksOfSc
     )
 
 
+def read_marks_together(files: MarkFiles, scenes: Sequence[tuple[Path, Scene]]) -> list[SceneMarks]:
+    """The marks of several scenes, none in some of them; those of one name are one point.
+
+    Marks that their files hold out are not used.
+
+    Args:
+        files: of the marks.
+        scenes: with the files of their images.
+
+    Raises:
+        InputError: as `read_control_marks`; or no scene has a mark.
+    """
+    every = [read_control_marks(files, image, scene, may_lack=True).control for image, scene in scenes]
+    names = dict.fromkeys(name for marks in every for name in marks.names)
+    if not names:
+        raise InputError(f"{files.name}: expected marks in one of {len(scenes)} images, found none")
+    number = {name: -(k + 1) for k, name in enumerate(names)}
+    return [
+        replace(marks, number=np.array([number[name] for name in marks.names], dtype=np.int64))
+        for marks in every
+    ]
+
+
 def _completed(
     marks: MarkedPoints, path: Path, points: PointStatements, image: Path, scene: Scene
 ) -> MarkedPoints:
     """The marks of a file in one image, with sigmas that the caller states, or that are assumed."""
-    if len(marks) == 0:
-        raise InputError(f"{path.name}: none of its marks is switched on; switch some on")
-    taken = marks_in_image(marks, path, image, scene)
+    taken = marks if len(marks) == 0 else marks_in_image(marks, path, image, scene)
     statements: Statements = ()
     sigma_m, sigma_px = taken.sigma_m, taken.sigma_px
     if points.sigma_m is not None:
@@ -190,6 +219,12 @@ def _on_terrain(marks: MarkedPoints, path: Path, files: MarkFiles) -> MarkedPoin
     used = Statement(path.name, Subject.VERTICAL_DATUM, Use.USED, value, "heights of the marks")
     statements = (*marks.statements, *terrain.statements, used)
     return replace(marks, lon_lat_h=lon_lat_h, sigma_m=sigma_m, statements=statements)
+
+
+def _of_image(marks: MarkedPoints, image: Path) -> MarkedPoints:
+    """The marks that are in an image, or name none; perhaps none of them."""
+    names = np.char.lower(marks.image)
+    return marks.take(np.isin(names, ["", image.name.lower(), image.stem.lower()]))
 
 
 def _refuse_twice(names: Sequence[str], files: MarkFiles) -> None:

@@ -11,6 +11,7 @@ from amers.app.storage import Storage
 from amers.app.usecases.damage import open_chips
 from amers.services.formats.block.check import check_block
 from amers.services.formats.block.reader import FolderChips
+from amers.services.registration.scene_marks import NO_MARKS, NoChips
 from amers.services.reports.report import BlockUsed
 from amers.services.types import Array, ChipSource, ControlPoints
 
@@ -44,6 +45,11 @@ def points_of_block(folder: Path) -> FindPoints:
         return ControlSet(contents.points, FolderChips(folder), (block,))
 
     return find
+
+
+def no_points(outline: Array) -> ControlSet:
+    """A source of no points, where scenes are registered on marks of a person alone."""
+    return ControlSet(NO_MARKS.points, NoChips(), ())
 
 
 def points_of_store(database: Database, storage: Storage) -> FindPoints:

@@ -11,7 +11,8 @@ import shapely
 
 from amers.app.usecases.control_files import IMAGES_NPZ
 from amers.app.usecases.executors import ComputeOptions, open_executor
-from amers.app.usecases.registration.control_sources import FindPoints
+from amers.app.usecases.registration.control_marks import MarkFiles, read_marks_together
+from amers.app.usecases.registration.control_sources import ControlSet, FindPoints
 from amers.app.usecases.registration.failure import Attempt, write_failure
 from amers.app.usecases.registration.joined_scenes import (
     SCENES_JSON,
@@ -32,6 +33,7 @@ from amers.services.formats.adjusted_images import write_adjusted_images
 from amers.services.imagery.scene import Scene, scene_footprint
 from amers.services.joint.registration import AdjustedScenes, JointRegistration, register_together
 from amers.services.registration.options import RegistrationOptions
+from amers.services.registration.scene_marks import SceneMarks, with_marks
 from amers.services.reports.joint import JointReport, joint_report
 from amers.services.reports.joint_pages import JOINT_PAGE
 from amers.services.sensors.pushbroom import PushbroomModel
@@ -97,6 +99,7 @@ def run_joint_registration(
     find_points: FindPoints,
     place: JointPlace,
     *,
+    marks: MarkFiles | None = None,
     options: RegistrationOptions = RegistrationOptions(),
     copy_image: bool = False,
     progress: Progress = no_progress,
@@ -110,6 +113,7 @@ def run_joint_registration(
         files: of the scenes, by the names of their folders.
         find_points: finds control points.
         place: of the work and of the results.
+        marks: files of ground points that a person marked in the images; None for none.
         options: of the registration.
         copy_image: also copy GeoTIFFs, with the refined models in their tags.
         progress: receives the fraction done and a message.
@@ -128,7 +132,7 @@ def run_joint_registration(
         scenes = _Scenes(place, attempts, before)
         scenes.read(files, stack)
         try:
-            result = _register(scenes, find_points, options, progress)
+            result = _register(scenes, find_points, marks, options, progress)
         except AmersError as error:
             scenes.failed = {name: scenes.failed.get(name, error) for name in attempts}
             scenes.write_failures()
@@ -185,7 +189,11 @@ class _Scenes:
 
 
 def _register(
-    scenes: _Scenes, find_points: FindPoints, options: RegistrationOptions, progress: Progress
+    scenes: _Scenes,
+    find_points: FindPoints,
+    marks: MarkFiles | None,
+    options: RegistrationOptions,
+    progress: Progress,
 ) -> JointRegistration:
     """Scenes registered together on the control points of their ground, which the attempts note."""
     opened = [one.scene for one in scenes.opened]
@@ -197,6 +205,7 @@ def _register(
     control = find_points(_outline(opened))
     for one in scenes.opened:
         scenes.attempts[one.folder].control = control
+    every = None if marks is None else _marks(scenes, marks, control)
     joined = scenes.place.joined
     before = tuple(one.scene for one in scenes.before)
     with open_executor(scenes.place.compute) as (executor, ahead):
@@ -205,10 +214,22 @@ def _register(
             control.points,
             control.chips,
             options,
+            marks=every,
             joined=None if joined is None else AdjustedScenes(before, joined.known),
             work=Work(executor, ahead=ahead),
             progress=part_of(progress, 0.0, 0.85),
         )
+
+
+def _marks(scenes: _Scenes, files: MarkFiles, control: ControlSet) -> list[SceneMarks]:
+    """The marks of each scene, which its attempt notes beside the points of the base."""
+    every = read_marks_together(files, [(one.files.image, one.scene) for one in scenes.opened])
+    for one, own in zip(scenes.opened, every, strict=True):
+        attempt = scenes.attempts[one.folder]
+        attempt.control = replace(control, points=with_marks(control.points, own))
+        attempt.marks = files.name
+        attempt.statements.extend(own.statements)
+    return every
 
 
 def _write(
