@@ -12,7 +12,7 @@ use in geodetic networks). The worst leaves, one at a time, as long as most of t
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from amers.services.errors import CoverageError
 from amers.services.misfit.control_observations import ControlObservations
@@ -142,7 +142,7 @@ def _snooped(system: "_System", usable: BoolArray, priors: MarkPriors) -> _Agree
     """The marks without those that disagree with the others, the worst first."""
     alternative = np.full(len(usable), -1, dtype=np.int64)
     count = int(usable.sum())
-    active, limit = usable.copy(), system.scale2(usable) * chi2.isf(_FALSE_ALARM / count, 2)
+    active, limit = usable.copy(), system.scale2(usable) * float(chdtri(2, _FALSE_ALARM / count))
     while active.sum() > 1:
         test = np.where(active, system.test(active, priors), -np.inf)
         worst, second = np.argsort(test)[:-3:-1]

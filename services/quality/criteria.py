@@ -64,9 +64,9 @@ _DESCRIPTIONS = {
         "Area that points hold",
         "%",
         0,
-        "Share of the image for which the accuracy is stated: an active point lies within a reach, the "
-        "distance in which a typical point has four others (at most 15 % of a side), and no more points "
-        "there agree on another place.",
+        "Share of the image for which the accuracy is stated: an active point lies within reach (15 % "
+        "of a side, or what its chip shows), and of the points tried nearest to a place some are active"
+        ", more than agree on another place.",
     ),
     "active_of_matched": _Description(
         "Active / matched", "", 2, "Active points divided by matched points."

@@ -20,7 +20,7 @@ from amers.services.matching.predict import in_image
 from amers.services.misfit.broken_image import FEWEST_IN_PART, held_parts
 from amers.services.misfit.structure import Structure
 from amers.services.quality.finding import Finding
-from amers.services.quality.held_area import HeldArea, held_area
+from amers.services.quality.held_area import HeldArea, TriedPoints, held_area
 from amers.services.quality.line_of_sight import ImpliedSight, implied_sight
 from amers.services.quality.normal_law import CIRCULAR_CE90, normal_ce90
 from amers.services.quality.points_elsewhere import agree_elsewhere, elsewhere_words
@@ -204,21 +204,25 @@ def _held(scene: AdjustedScene) -> HeldArea:
     )
     if scene.elsewhere is not None:
         away[scene.elsewhere.rows] = True
-    agreeing = measures.line_sample[measures.active]
-    if scene.tie_places is not None:
-        agreeing = np.concatenate([agreeing, scene.tie_places])
     chip_side_px = CHIP_SIZE * scene.control_gsd_m / scene.gsd_m
-    tried = in_image(expected, scene.shape, 0.0) & (measures.reason != "not_tried")
     # A chip that reaches beyond the border has no pixels there, but the image has.
     empty = (measures.reason == "nodata") & in_image(expected, scene.shape, -chip_side_px / 2.0)
-    return held_area(
-        agreeing,
-        expected[away],
-        scene.shape,
-        chip_side_px,
-        _parts(scene),
-        empty=expected[tried & empty],
-        shown=expected[tried & ~empty],
+    tried = in_image(expected, scene.shape, 0.0) & (measures.reason != "not_tried")
+    tried &= empty | (measures.reason != "nodata")
+    points = TriedPoints(expected, measures.active, away, empty).take(tried)
+    return held_area(_with_ties(points, scene.tie_places), scene.shape, chip_side_px, _parts(scene))
+
+
+def _with_ties(points: TriedPoints, tie_places: Array | None) -> TriedPoints:
+    """Points, and ties with other scenes, which hold an image as well."""
+    if tie_places is None:
+        return points
+    ties = np.ones(len(tie_places), dtype=bool)
+    return TriedPoints(
+        np.concatenate([points.line_sample, tie_places]),
+        np.concatenate([points.agrees, ties]),
+        np.concatenate([points.elsewhere, ~ties]),
+        np.concatenate([points.empty, ~ties]),
     )
 
 

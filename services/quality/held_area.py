@@ -2,12 +2,12 @@
 
 A correction is checked where points agree with it. Elsewhere it is an extrapolation, and what a scanner
 did there (lines lost, an attitude that jumped) nobody saw. A place is held by an agreeing point within
-a reach, unless as many points there agree with each other on another displacement.
+reach, if among the points that were tried nearest to it some agree, and more than agree with each other
+on another place.
 
-The reach is the distance within which a typical point has four others, and at least that to the corners
-of a chip, which shows all of its square. Of points at random, none lies
-within it of a place by a chance of exp(-4): where none agrees, something is other than elsewhere, be it
-cloud, water, changed ground or lines that were lost. Nobody need know which: nothing is stated there.
+As many of the nearest are asked as all but surely have one that agrees, where points agree as they do in
+the whole image. Where none does, something is other than elsewhere, be it cloud, water, changed ground
+or lines that were lost. Nobody need know which: nothing is stated there.
 """
 
 from dataclasses import dataclass, replace
@@ -21,8 +21,10 @@ from shapely.geometry.base import BaseGeometry
 from amers.services.misfit.broken_image import FEWEST_IN_PART
 from amers.services.types import Array, BoolArray
 
-NEIGHBOURS = 4
-"""Other points within the reach of a typical one: exp(-4) = 2 % of a clean image are lost."""
+_LOST = 0.02
+"""Chance that none of the nearest points agrees at a place of a clean image, which is lost by that."""
+_MOST_ASKED = 12
+"""Nearest points that are asked at most, where few agree at all."""
 MOST_REACH = 0.15
 """Reach at most, sides of a square image of as many pixels: a limit that people set. One point in the
 middle of each fifth of both axes holds the whole image."""
@@ -30,8 +32,7 @@ MOST_WORSE = 3.0
 """CE90 of a place over that of half of the places, beyond which no accuracy is stated there: as a result
 is called wrong that is off by more than three times what it states."""
 _CELLS = 50
-"""Along each side of an image, of the raster in which the area is told: two percent, as the chance
-above."""
+"""Along each side of an image, of the raster in which the area is told: two percent each."""
 
 
 @dataclass(frozen=True)
@@ -115,44 +116,79 @@ def cell_places(shape: tuple[int, int]) -> Array:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
+@dataclass(frozen=True)
+class TriedPoints:
+    """Points that were looked for in an image.
+
+    Attributes:
+        line_sample: (n, 2) where the scene places them.
+        agrees: (n,) with the scene.
+        elsewhere: (n,) with each other, on another displacement.
+        empty: (n,) whether the image has no pixels there, as at the border of one turned north up.
+    """
+
+    line_sample: Array
+    agrees: BoolArray
+    elsewhere: BoolArray
+    empty: BoolArray
+
+    def take(self, rows: BoolArray) -> Self:
+        """Some of the points (n,)."""
+        return type(self)(
+            self.line_sample[rows], self.agrees[rows], self.elsewhere[rows], self.empty[rows]
+        )
+
+
 def held_area(
-    agreeing: Array,
-    elsewhere: Array,
-    shape: tuple[int, int],
-    chip_side_px: float,
-    parts: Array | None = None,
-    *,
-    empty: Array | None = None,
-    shown: Array | None = None,
+    points: TriedPoints, shape: tuple[int, int], chip_side_px: float, parts: Array | None = None
 ) -> HeldArea:
     """The part of an image that points hold.
 
     Args:
-        agreeing: (n, 2) line and sample of points that agree with the scene.
-        elsewhere: (k, 2) of points that agree with each other on another displacement.
+        points: that were looked for.
         shape: lines and samples of the image.
         chip_side_px: of the chips of the points in the image: all that a chip shows has been compared.
         parts: (p, 4) first and last lines and samples of parts of the image that lie by themselves,
             such as between breaks: three points or more hold a part, and none of another part does.
             None for none.
-        empty: (e, 2) where points were looked for and the image has no pixels: a border of an image that
-            was turned north up. None for none.
-        shown: (m, 2) where points were looked for and it has.
     """
-    reach_px = max(_reach_px(agreeing, shape), chip_side_px / np.sqrt(2.0))
+    side_px = float(np.sqrt(shape[0] * shape[1]))
+    reach_px = max(MOST_REACH * side_px, chip_side_px / np.sqrt(2.0))
     places = cell_places(shape)
-    held = _are_held(agreeing, elsewhere, places, reach_px)
+    shown = points.take(~points.empty)
+    asked = _asked(shown.agrees)
+    held = _are_held(shown, places, reach_px, asked)
     for bounds in np.empty((0, 4)) if parts is None else parts:
-        of_part, own, other = (_inside(one, bounds) for one in (places, agreeing, elsewhere))
-        held[of_part] &= own.sum() >= FEWEST_IN_PART
-        held[of_part] &= _are_held(agreeing[own], elsewhere[other], places[of_part], reach_px)
-    of_image = held | ~_are_nearer(empty, shown, places)
+        of_part, own = _inside(places, bounds), shown.take(_inside(shown.line_sample, bounds))
+        held[of_part] &= own.agrees.sum() >= FEWEST_IN_PART
+        held[of_part] &= _are_held(own, places[of_part], reach_px, asked)
+    of_image = held | ~_are_nearer(points.line_sample[points.empty], shown.line_sample, places)
     return HeldArea(held.reshape(_CELLS, _CELLS), of_image.reshape(_CELLS, _CELLS), shape, reach_px)
 
 
-def _are_nearer(some: Array | None, others: Array | None, places: Array) -> BoolArray:
+def _asked(agrees: BoolArray) -> int:
+    """How many of the nearest points all but surely have one that agrees, as points (n,) do."""
+    share = float(agrees.mean()) if len(agrees) else 0.0
+    if share in (0.0, 1.0):
+        return 1 if share else _MOST_ASKED
+    return int(np.clip(np.ceil(np.log(_LOST) / np.log(1.0 - share)), 1, _MOST_ASKED))
+
+
+def _are_held(points: TriedPoints, places: Array, reach_px: float, asked: int) -> BoolArray:
+    """Which places (m, 2) have an agreeing point in reach, and enough of those asked on its side."""
+    agreeing = points.line_sample[points.agrees]
+    if not len(agreeing) or not len(places):
+        return np.zeros(len(places), dtype=bool)
+    distance, _ = KDTree(agreeing).query(places)
+    count = min(asked, len(points.line_sample))
+    _, near = KDTree(points.line_sample).query(places, k=np.arange(1, count + 1))
+    agree, elsewhere = (of_points[near].sum(axis=1) for of_points in (points.agrees, points.elsewhere))
+    return np.asarray((distance <= reach_px) & (agree > elsewhere))
+
+
+def _are_nearer(some: Array, others: Array, places: Array) -> BoolArray:
     """Which places (m, 2) are nearer to some points than to others; none without points."""
-    if some is None or others is None or not len(some) or not len(others):
+    if not len(some) or not len(others):
         return np.zeros(len(places), dtype=bool)
     near, far = (KDTree(points).query(places)[0] for points in (some, others))
     return np.asarray(near < far)
@@ -162,26 +198,3 @@ def _inside(line_sample: Array, bounds: Array) -> BoolArray:
     """Which places (n, 2) lie between first and last line, first and last sample."""
     low, high = bounds[[0, 2]] - 0.5, bounds[[1, 3]] + 0.5
     return np.asarray(((line_sample > low) & (line_sample < high)).all(axis=1))
-
-
-def _are_held(agreeing: Array, elsewhere: Array, places: Array, reach_px: float) -> BoolArray:
-    """Which places (m, 2) have an agreeing point in reach, and fewer points that agree elsewhere."""
-    votes = _within(agreeing, places, reach_px)
-    return np.asarray((votes > 0) & (votes > _within(elsewhere, places, reach_px)))
-
-
-def _reach_px(agreeing: Array, shape: tuple[int, int]) -> float:
-    """Median distance to the fourth neighbour among points (n, 2), at most the largest reach."""
-    most_px = MOST_REACH * float(np.sqrt(shape[0] * shape[1]))
-    if len(agreeing) <= NEIGHBOURS:
-        return most_px
-    distance, _ = KDTree(agreeing).query(agreeing, k=NEIGHBOURS + 1)
-    return min(float(np.median(distance[:, -1])), most_px)
-
-
-def _within(points: Array, places: Array, reach_px: float) -> Array:
-    """Number (m,) of points (n, 2) within a reach of places (m, 2)."""
-    if not len(points):
-        return np.zeros(len(places))
-    counts = KDTree(points).query_ball_point(places, reach_px, return_length=True)
-    return np.asarray(counts, np.float64)

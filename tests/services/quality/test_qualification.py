@@ -10,7 +10,7 @@ import pytest
 from amers.services.errors import NotEnoughPoints
 from amers.services.quality.cell_stability import measure_cell_stability
 from amers.services.quality.criteria import verdict_of, verdict_scope
-from amers.services.quality.held_area import held_area
+from amers.services.quality.held_area import TriedPoints, held_area
 from amers.services.quality.normal_law import CIRCULAR_CE90
 from amers.services.quality.predicted import predict_accuracy
 from amers.services.quality.qualification import (
@@ -196,7 +196,8 @@ def test_the_prediction_grows_towards_the_edge_along_a_drift(registered):
 
 def test_points_are_counted_in_cells_beside_the_share_of_the_image_that_they_hold():
     line_sample = np.array([[-0.5, -0.5], [10.0, 10.0], [99.4, 199.4], [50.0, np.nan]])
-    held = held_area(line_sample[:3], np.empty((0, 2)), (100, 200), 0.0)
+    agree, nothing = np.ones(3, dtype=bool), np.zeros(3, dtype=bool)
+    held = held_area(TriedPoints(line_sample[:3], agree, nothing, nothing), (100, 200), 0.0)
     coverage = image_coverage(line_sample, held, 5)
     assert (coverage.cells[0, 0], coverage.cells[4, 4]) == (2, 1)
     assert coverage.percent == held.percent
