@@ -242,8 +242,12 @@ def grey_map(page: Page) -> np.ndarray:
 
 
 def test_a_scene_tells_its_state_and_is_registered_again_with_other_options(
-    visit, world, secret, service
+    visit, world, secret, service, tmp_path
 ):
+    lon, lat, h = world.true_model.locate(np.array([[600.0, 600.0]]), np.array([GROUND_H]))[0].tolist()
+    marks = tmp_path / "marks.csv"
+    head = "# pixel-origin=centre heights=ellipsoid\nid,lon,lat,height_m,line,sample\n"
+    marks.write_text(f"{head}GCP,{lon!r},{lat!r},{h!r},600,600\n")
     headers = {"Authorization": f"Bearer {secret}"}
     with httpx.Client(base_url=service.url, headers=headers, timeout=30.0) as client:
         new = client.post("/scenes?name=new.tif", content=world.tagged.read_bytes()).json()["id"]
@@ -283,6 +287,11 @@ def test_a_scene_tells_its_state_and_is_registered_again_with_other_options(
         assert report["correction"]["order"] == "drift"
         page.goto(f"{service.url}/map#/scene/{new}")
         expect(page.get_by_role("button", name="Register", exact=True)).to_be_visible()
+        page.locator("#marks").set_input_files(marks)
+        page.get_by_label("Registered on").select_option("marks")
+        page.get_by_role("button", name="Register", exact=True).click()
+        expect(page.get_by_role("link", name="Open the report")).to_be_visible()
+        assert [mark["name"] for mark in report_of(page, service, secret)["marks"]["marks"]] == ["GCP"]
         page.goto(f"{service.url}/map#/scene/{inputs['scene']}")
         expect(page.locator(".story li")).to_have_count(2)
 

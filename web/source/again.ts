@@ -6,7 +6,7 @@ import { fill, h, problem } from "./elements";
 import { go } from "./page";
 import { uploadBeside } from "./upload";
 
-const METHODS = { auto: "control points, or else a reference image", points: "control points only", reference: "a reference image" };
+const METHODS = { auto: "control points, or else a reference image", points: "control points only", reference: "a reference image", marks: "marks only" };
 const ORDERS = { "": "chosen by the points", shift: "shift", drift: "shift and drift", affine: "affine" };
 
 /** Of a registration, where a correction is demanded: the service takes the options of the adjustment as a whole. */
@@ -27,6 +27,8 @@ export function registrationForm(scene: Scene): HTMLElement {
   const mask = h("input", { type: "file", id: "mask", accept: ".tif,.tiff" });
   const checks = h("input", { type: "file", id: "check-points" });
   const heights = h("input", { id: "check-heights", spellcheck: false, autocomplete: "off" });
+  const marks = h("input", { type: "file", id: "marks" });
+  const marksHeights = h("input", { id: "marks-heights", spellcheck: false, autocomplete: "off" });
   const button = h("button", { type: "submit", class: "strong" }, scene.registrations.length ? "Register again" : "Register");
   const message = h("div");
   return h(
@@ -35,10 +37,11 @@ export function registrationForm(scene: Scene): HTMLElement {
     ...labelled(sigma, "Accuracy of the model, metres", "1 sigma on the ground; raise it when points lie at the edge of the search"),
     ...labelled(method, "Registered on"),
     ...labelled(order, "Correction"),
+    ...labelled(marks, "Marks", "ground points that you marked in the image: CSV, QGIS, ENVI, PCI, ASP or another format; one is enough"),
     h(
       "details",
       {},
-      h("summary", {}, "Bands, mask, check points"),
+      h("summary", {}, "Bands, mask, check points, datum of marks"),
       h(
         "div",
         { class: "fields" },
@@ -46,6 +49,7 @@ export function registrationForm(scene: Scene): HTMLElement {
         ...labelled(mask, "Mask", "pixels that are not zero are not used"),
         ...labelled(checks, "Check points", "GeoJSON, CSV or another format of points; held out of the registration"),
         ...labelled(heights, "Vertical datum of their heights", "ellipsoid, EGM96, EPSG:…"),
+        ...labelled(marksHeights, "Vertical datum of the marks", "ellipsoid, EGM96, EPSG:…; where their file states none"),
       ),
     ),
     button,
@@ -65,6 +69,9 @@ export function registrationForm(scene: Scene): HTMLElement {
       const [maskFile] = mask.files ?? [];
       const [checkFile] = checks.files ?? [];
       if (maskFile) inputs["mask"] = await uploadBeside(scene.id, maskFile);
+      const [marksFile] = marks.files ?? [];
+      if (marksFile) inputs["control"] = await uploadBeside(scene.id, marksFile);
+      if (marksFile && marksHeights.value.trim()) inputs["control_heights"] = marksHeights.value.trim();
       if (checkFile) inputs["check_points"] = await uploadBeside(scene.id, checkFile);
       go(`#/job/${await register(scene.id, inputs)}`);
     } catch (error) {
