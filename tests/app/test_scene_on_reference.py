@@ -84,6 +84,35 @@ def test_the_stated_frame_of_a_reference_gives_an_accuracy_on_the_earth(
     assert "add --reference" in capsys.readouterr().err
 
 
+def write_marks(path: Path) -> Path:
+    """Three marks of the ground that the reference shows, without heights."""
+    places = np.array([[80.0, 90.0], [300.0, 340.0], [200.0, 100.0]])
+    rows = [
+        f"GCP{k},{5e5 + 10.0 * (sample + 0.5)},{5e6 - 10.0 * (line + 0.5)},{seen[0]},{seen[1]},2,0.2"
+        for k, ((line, sample), seen) in enumerate(zip(places, places + SHIFT_PX, strict=True))
+    ]
+    head = ["# pixel-origin=centre crs=EPSG:32632", "id,x,y,line,sample,sigma_horizontal_m,sigma_px"]
+    path.write_text("\n".join([*head, *rows]) + "\n")
+    return path
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("alone", [True, False])
+def test_marks_need_no_heights_on_a_map_and_are_added_to_a_reference(
+    images: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], alone: bool
+) -> None:
+    reference, scene = images
+    command = ["scene", "register", scene, "--sigma-m", "40", "-o", tmp_path / "out", "--json"]
+    marks = ["--control", write_marks(tmp_path / "marks.csv")]
+    assert run(*command, *marks, *([] if alone else ["--reference", reference])) == 0
+    output = json.loads(capsys.readouterr().out)
+    assert np.abs(np.array(output["shift_px"]) - SHIFT_PX).max() < 2.0 * SHIFT_ALLOWED_PX
+    assert [mark["status"] for mark in output["marks"]["marks"]] == ["used"] * 3
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    names = [block["id"] for block in report["run"]["blocks"]]
+    assert names == (["marks.csv"] if alone else ["reference.tif", "marks.csv"])
+
+
 def test_terrain_without_a_reference_is_a_mistake(images: tuple[Path, Path], tmp_path: Path) -> None:
     reference, scene = images
     assert run("scene", "register", scene, "--dem", reference, "-o", tmp_path / "none") == 2
