@@ -23,6 +23,9 @@ _CANDIDATES = 11
 _BORDER = 0.05
 """Share of the image along its border where none is: a person needs the surroundings of a detail."""
 
+_MOST_LEFT_OUT = 50
+"""Marks beside other points that are left out one by one: each repeats the adjustment of all of them."""
+
 
 @dataclass(frozen=True)
 class MarkResult:
@@ -109,7 +112,6 @@ def marks_report(
         sigma_m: (n, 3) of their ground.
     """
     measures, notes = scene.measures, _notes(marked, names)
-    rejected = measures.matched & ~measures.active
     used: MarkStatus = "in doubt" if marked.disagree else "used"
     marks = tuple(
         MarkResult(
@@ -125,8 +127,8 @@ def marks_report(
             residual_px=measures.residual_px[row],
             left_out_px=marked.left_out_px[row],
             left_out_sigma_px=marked.left_out_sigma_px[row],
-            status="rejected" if rejected[row] else used,
-            note=notes[row],
+            status=used if measures.active[row] else "rejected",
+            note=notes[row] if measures.matched[row] else "the model has no position for this ground",
         )
         for row, name in enumerate(names)
     )
@@ -181,13 +183,14 @@ def marks_beside_points(scene: AdjustedScene, names: Sequence[str], sigma_m: Arr
 def _without_each(scene: AdjustedScene, rows: IntArray) -> Array:
     """Misfit (n, 2) of measures at some rows (n,) against the adjustment without each of them.
 
-    That of a rejected one is its residual; in a block of many scenes the others are not known.
+    That of a rejected one is its residual; in a block of many scenes, and of many marks, the others are
+    not known.
     """
     left_out_px = scene.measures.residual_px[rows].copy()
-    if scene.refit is None:
+    if scene.refit is None or len(rows) > _MOST_LEFT_OUT:
         left_out_px[scene.measures.active[rows]] = np.nan
     for number, row in enumerate(rows.tolist()):
-        if not scene.measures.active[row] or scene.refit is None:
+        if not scene.measures.active[row] or scene.refit is None or len(rows) > _MOST_LEFT_OUT:
             continue
         used = scene.measures.active.copy()
         used[row] = False
