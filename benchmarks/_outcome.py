@@ -71,9 +71,9 @@ class Outcome:
     wrong_share: float = float("nan")
     judged_share: float = 1.0
     line_gap_px: float = float("nan")
-    held_percent: float = float("nan")
     spacing_px: float = float("nan")
     followable: bool = False
+    held_percent: float = 100.0
 
     @property
     def delivered(self) -> bool:

@@ -27,7 +27,7 @@ GROUND = texture(np.random.default_rng(4), SIDE, 3.0)
 MODEL = Details(np.zeros((2, 2, 1, 1))).model
 """An image of 256 lines and samples, north up."""
 REFERENCE_PIXELS = as_pixels(GROUND)
-REFERENCE = Reference(ArrayImage(REFERENCE_PIXELS), MODEL, None, 0.3, 1.0, common_sigma_m=0.4)
+REFERENCE = Reference(ArrayImage(REFERENCE_PIXELS), MODEL, None, 0.3, common_sigma_m=0.4)
 OPTIONS = ReferenceMatchingOptions()
 SHIFT_PX = np.array([2.3, -1.6])
 """Rows and columns by which the scene shows all ground off its model."""

@@ -27,7 +27,7 @@ LOCAL_M = 1.6
 SHIFT_M = np.array([14.0, -9.0])
 OWN = Frame.from_sigmas(4.0, 5.0)
 MAP = Frame.from_sigmas(3.0, 2.0)
-EXACT = Reference(ArrayImage(np.zeros((1, 1))), None, None, 0.0, 0.0, 0.0, MAP)  # type: ignore[arg-type]
+EXACT = Reference(ArrayImage(np.zeros((1, 1))), None, None, 0.0, 0.0, MAP)  # type: ignore[arg-type]
 a_twentieth_of_a_pixel_m = 0.05 * GSD_M
 
 

@@ -91,7 +91,7 @@ def reach_m(block_m: float, ortho_m: float, point_m: float) -> float:
     grid = MapGrid("EPSG:32631", np.zeros(2), np.array([[0.0, 1.0], [-1.0, 0.0]]), (10, 10))
     image, frame = ArrayImage(np.zeros((10, 10), dtype=np.float32)), Frame.from_sigmas(ortho_m, 1.0)
     return expected_reach_m(
-        here, Site("a", False, Reference(image, OrthoModel(grid), None, 0.1, 1.0, 0.0, frame))
+        here, Site("a", False, Reference(image, OrthoModel(grid), None, 0.1, 0.0, frame))
     )
 
 

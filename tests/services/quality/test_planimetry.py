@@ -85,7 +85,7 @@ def site(
     return Site(
         name,
         is_control,
-        Reference(image, map_of(first, shape), None, local_m, 1.0, 0.0, Frame.from_sigmas(0.5, 0.5)),
+        Reference(image, map_of(first, shape), None, local_m, 0.0, Frame.from_sigmas(0.5, 0.5)),
     )
 
 
