@@ -59,6 +59,8 @@ class QualificationOptions:
         max_ce90_on_earth_m: largest CE90 on the Earth, with the frame of the control points, of a usable
             registration; None sets no limit.
         good_unit_weight: largest standard deviation of unit weight: residuals over the stated sigmas.
+        good_second_consensus_share: has no effect any more: points that agree on another place are a
+            finding. Requests of earlier versions state it.
         usable_active_points: smallest number of active points.
         usable_active_of_few: smallest ratio of active to matched points where fewer points are active
             than a good registration has, or where they scatter by more than one allows: part of a few
@@ -79,6 +81,7 @@ class QualificationOptions:
     good_ce90_m: float = 0.75
     max_ce90_on_earth_m: float | None = None
     good_unit_weight: float = 3.0
+    good_second_consensus_share: float = 0.3
     usable_active_points: int = 6
     usable_active_of_few: float = 0.75
     usable_residual_std_px: float = 2.0

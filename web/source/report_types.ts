@@ -265,6 +265,7 @@ export interface QualificationOptions {
   good_ce90_m: number | null;
   max_ce90_on_earth_m: number | null | null;
   good_unit_weight: number | null;
+  good_second_consensus_share: number | null;
   usable_active_points: number;
   usable_active_of_few: number | null;
   usable_residual_std_px: number | null;
