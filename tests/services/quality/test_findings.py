@@ -55,11 +55,21 @@ def test_pixels_that_are_displaced_everywhere_are_in_the_accuracy(registered: Ma
 
 def test_a_fault_with_a_place_is_told_and_harms_by_what_points_show(registered: Make) -> None:
     scene = registered().adjusted()
-    found = (fault(Fault.SECOND_IMAGE, 12.0), fault(Fault.REPEATED_LINES, 5.0))
+    found = (fault(Fault.PART, 12.0), fault(Fault.REPEATED_LINES, 5.0))
     result = qualified(replace(scene, pixel_findings=found))
     assert result.verdict == "good"
-    assert {one.name for one in result.findings} == {"second image", "repeated lines"}
+    assert {one.name for one in result.findings} == {"part of another image", "repeated lines"}
     assert result.predicted.overall_px == qualified(scene).predicted.overall_px
+
+
+@pytest.mark.parametrize(("away_px", "pull_px"), [(0.4, 0.4), (5.0, 1.0), (40.0, 1.0)])
+def test_a_second_image_pulls_matches_by_a_pixel_however_far_it_lies(
+    registered: Make, away_px: float, pull_px: float
+) -> None:
+    scene = registered().adjusted()
+    clean = qualified(scene).predicted.overall_px
+    result = qualified(replace(scene, pixel_findings=(fault(Fault.SECOND_IMAGE, away_px),)))
+    assert result.predicted.overall_px == pytest.approx(np.hypot(clean, pull_px), rel=0.02)
 
 
 def test_a_part_behind_a_break_without_three_points_is_not_held(registered: Make) -> None:
