@@ -66,4 +66,7 @@ def test_chips_over_gentle_ground_imply_the_line_of_sight_of_their_scene() -> No
         result = register_scene(replace(seen, model=other.delivered), made.points, chips)
         told = [one for one in result.qualification.findings if one.name == "line_of_sight"]
         assert bool(told) != met
-        assert result.qualification.verdict == ("good" if met else "failed")
+        assert (result.qualification.verdict == "good") == met
+        if not met:
+            # Hills of some metres, seen from beside: what they are off by is in the accuracy.
+            assert result.qualification.predicted.overall_px > 1.0
