@@ -6,7 +6,7 @@ matched without any model, smoothed to about a tenth of a pixel. A scene is wron
 what it states to hold is more than 3 times the stated one, or a tenth of that area is.
 Needs AMERS_REAL_DATA. Outcomes are appended to a file; a scene is not repeated as long as the sources
 are the same.
-Run: python -m benchmarks.real_scenes [--faults 415] [--clean 110] [--any-code]
+Run: python -m benchmarks.real_scenes [--faults 415] [--clean 119] [--any-code]
 """
 
 import argparse

@@ -125,7 +125,7 @@ def _note(structure: Structure, shape: tuple[int, int]) -> Finding:
 
 
 def _of_sight(scene: AdjustedScene) -> list[Finding]:
-    """The clearest sign that heights move points otherwise than the model says, if there is one."""
+    """The most harmful sign of another line of sight, if there is one."""
     slopes = [one.slope_px for one in scene.adjustment.structures if _moves_with_height(one)]
     if scene.elsewhere is not None and scene.elsewhere.slope_px is not None:
         slopes.append(scene.elsewhere.slope_px)

@@ -41,7 +41,7 @@ class HeldArea:
 
     Attributes:
         cells: (c, c) whether each cell of the image is held, rows from the first line down.
-        of_image: (c, c) whether it has pixels, as far as points tell; cells that are held have.
+        of_image: (c, c) whether it has pixels: all cells but those nearest to points that found none.
         shape: lines and samples of the image.
         reach_px: of a point.
     """

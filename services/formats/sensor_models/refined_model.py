@@ -192,8 +192,9 @@ def _write_rpc(
     if refined.max_error_px > max(stated_px, LOUD_PX):
         note = (
             f"no refined RPC is written: the nearest is up to {refined.max_error_px:.2g} px off, more "
-            f"than the CE90 of {stated_px:.2g} px that is stated; no RPC follows lines and samples so. "
-            f"Use {CORRECTION_JSON} with the delivered model, or an orthorectified image"
+            f"than the CE90 of {stated_px:.2g} px that is stated relative to the control points; no RPC "
+            f"follows lines and samples so. Use {CORRECTION_JSON} with the delivered model, or an "
+            "orthorectified image"
         )
         return RefinedFiles((), refined.max_error_px, note)
     if refined.model is None:
