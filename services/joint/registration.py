@@ -196,7 +196,10 @@ def _measure_all(
         measured = []
         for number, future in enumerate(pending):
             progress(number / len(scenes), f"searching points: {number} of {len(scenes)} scenes")
-            measured.append(replace(future.result(), scene=scenes[number]))
+            found = future.result()
+            # Its pixels were measured where it was searched; its image is the one that is open here.
+            scene = replace(scenes[number], pixel_findings=found.scene.pixel_findings)
+            measured.append(replace(found, scene=scene))
         return measured
     finally:
         for future in pending:

@@ -10,7 +10,7 @@ from amers.services.types import Array, BoolArray, IntArray
 
 _NEAREST = 8
 """Nearest points left out, one of which has to be displaced alike: a limit that people set. Of false
-matches in a window of some pixels, fewer than 15 of 100 have one by chance (`test_points_elsewhere.py`)."""
+matches in a window of some pixels, fewer than 15 of 100 have one by chance: see its test."""
 _WITHIN = 0.15
 """Active points between the lines of points that lie elsewhere, over these, up to which they are of
 whole lines."""
