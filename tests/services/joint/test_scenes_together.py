@@ -107,6 +107,11 @@ def test_a_scene_of_other_ground_leaves_by_name() -> None:
     assert "elsewhere: " in str(left.error)
 
 
+def test_what_pixels_show_stays_with_the_scenes() -> None:
+    """They are measured where a scene is searched, in another process as well."""
+    assert all(one.scene.pixel_findings is not None for one in registered().block.scenes)
+
+
 def test_a_scene_registered_by_itself_is_the_same() -> None:
     points, chips = block()
     joint = register_together(scenes()[:1], points, chips).registrations[0]
