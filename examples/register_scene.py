@@ -14,7 +14,8 @@ import simulated_images
 
 from amers.services.formats.block.reader import FolderChips, read_block
 from amers.services.formats.images.scenes import read_scene
-from amers.services.formats.sensor_models.refined_model import ImageFiles, write_refined
+from amers.services.formats.sensor_models.refined_model import Stated, write_refined
+from amers.services.formats.sensor_models.rpc_files import ImageFiles
 from amers.services.registration.on_points import register_scene
 
 
@@ -45,13 +46,14 @@ def register(image: Path, block_folder: Path, folder: Path) -> None:
 
     model, adjustment = registration.model, registration.adjustment
     # All points of one block share its frame; the errors of the model on the Earth include it.
+    # They hold in the area that the points support, and nothing is stated outside it.
     refined = write_refined(
         ImageFiles(image),
         model,
         adjustment,
         shape=scene.image.shape,
         folder=folder,
-        frame=points.frames[0],
+        stated=Stated(points.frames[0], quality.coverage.outline),
     )
     print(f"{refined.note}: {', '.join(path.name for path in refined.files)}")
 
