@@ -1,6 +1,6 @@
 """Chips of the points of other bases, each as a small ortho-image: GCPLib and the Copernicus database.
 
-No real chip of either was available to try this reader on.
+Their layouts are those of public software that writes or reads them; no delivered chip was available.
 """
 
 import math
@@ -38,6 +38,8 @@ _MAX_SIDE = 1024
 _MAX_BYTES = 16 * _MAX_SIDE**2
 _RAW_TYPES = {"BYTE": "u1", "I*2": "<i2", "UI*2": "<u2", "R*4": "<f4"}
 """Types of pixels that the chip reader of the USGS accepts; its files are little-endian."""
+_COPERNICUS_FOLDER = "L1C_chips"
+"""Where the archives of the Copernicus database have their chips, beside its document."""
 _NODATA = 0
 """Value of pixels without data, as in the images of Landsat and Sentinel-2."""
 _NOON = time(12, tzinfo=UTC)
@@ -111,7 +113,7 @@ def read_base_chips(path: Path, folder: Path, pixel_origin: str | None = None) -
         return [
             BaseChip(
                 point_id,
-                folder_member(folder, name, "the folder of the chips"),
+                _copernicus_file(folder, name),
                 Acquisition(f"GRI-{number:02d}", "Sentinel-2", incidence_deg=0.0, azimuth_deg=0.0),
             )
             for point_id, number, name in copernicus_chips(text, path.name)
@@ -132,6 +134,13 @@ def open_base_chip(chip: BaseChip) -> Scene | str:
         return _raw_scene(chip, chip.raw) if chip.raw is not None else _geotiff_scene(chip)
     except (FormatError, OSError):
         return UNREADABLE
+
+
+def _copernicus_file(folder: Path, name: str) -> Path:
+    """The file of a chip: in a folder, or in the folder `L1C_chips` of an unpacked archive there."""
+    path = folder_member(folder, name, "the folder of the chips")
+    inside = folder_member(folder, f"{_COPERNICUS_FOLDER}/{path.name}", "the folder of the chips")
+    return inside if inside.is_file() and not path.is_file() else path
 
 
 def _gcplib_chip(record: GcplibRecord, folder: Path, first: float) -> BaseChip:

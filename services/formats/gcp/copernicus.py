@@ -1,9 +1,9 @@
 """Ground points of the Copernicus Sentinel-2 GCP database, JSON converted from XML.
 
 Numbers are strings, the text of an element with attributes is `#text`, and a list of one element is the
-element itself. Source: software that reads the database; its specification is not public.
-
-No real file was available to try this reader on.
+element itself. The Copernicus Data Space serves it as one gzipped tar for each tile (collection
+sentinel-2-gri-l1c-gcp), with the document and, in the folder `L1C_chips`, the chips. Source: software
+that downloads and reads it; its specification is not public. No file of it was available.
 """
 
 import re
@@ -13,7 +13,7 @@ import numpy as np
 
 from amers.services.errors import FormatError
 from amers.services.formats.elevation.heights import unit_m
-from amers.services.formats.gcp.map_check import check_map_position
+from amers.services.formats.gcp.map_check import checked_zone
 from amers.services.formats.gcp.marked_points import (
     WGS84_3D,
     Heights,
@@ -132,7 +132,7 @@ def _point(gcp: Any, where: str) -> tuple[str, tuple[float, float, float]]:
             f"{where}, ID {name}: EPSG: expected the code of a UTM zone of WGS 84, such as 32633, "
             f"found {epsg[:20]!r}"
         )
-    check_map_position((lon, lat), (x, y), f"EPSG:{epsg}", _PIXEL_M, f"{where}, ID {name}")
+    checked_zone((lon, lat), (x, y), f"EPSG:{epsg}", _PIXEL_M, f"{where}, ID {name}")
     return name, (lon, lat, height_m)
 
 

@@ -4,7 +4,7 @@
 fields separated by blanks. The header announces projection x before projection y; the software of the
 USGS writes and reads y before x. Source: the writer and the reader of the USGS Image Assessment System.
 
-The structure is that of this software. No real file was available to try it on.
+The structure is that of this software, to the byte. No file of the USGS itself was available.
 """
 
 import re
@@ -14,7 +14,7 @@ from datetime import date
 import numpy as np
 
 from amers.services.errors import FormatError
-from amers.services.formats.gcp.map_check import check_map_position
+from amers.services.formats.gcp.map_check import checked_zone
 from amers.services.formats.gcp.marked_points import (
     WGS84_3D,
     Heights,
@@ -158,7 +158,7 @@ def _record(line: str, where: str) -> GcplibRecord:
     if code is not None:
         xy = numbers["projection_x"], numbers["projection_y"]
         tolerance_m = max(abs(numbers["pixel_size_x"]), abs(numbers["pixel_size_y"]))
-        check_map_position((lon, lat), xy, code, tolerance_m, where)
+        code = checked_zone((lon, lat), xy, code, tolerance_m, where)
     return GcplibRecord(where, words, numbers, code, acquired_on)
 
 

@@ -10,12 +10,14 @@ from amers.services.map_grid import xy_of_lon_lat
 _FALSE_NORTHING_M = 10_000_000.0
 
 
-def check_map_position(
+def checked_zone(
     lon_lat: tuple[float, float], xy: tuple[float, float], utm: str, tolerance_m: float, where: str
-) -> None:
-    """Refuse a point whose position on a UTM map is not that of its longitude and latitude.
+) -> str:
+    """The UTM zone of a position on a map, which must be that of its longitude and latitude.
 
-    Northings south of the equator may count from the equator, as in northern zones.
+    Northings south of the equator may count from the equator, as in northern zones, or from a false
+    northing of 10,000 km, as in southern ones, whatever the record says: products of Landsat state
+    northern zones everywhere.
 
     Args:
         lon_lat: degrees, WGS 84.
@@ -23,6 +25,9 @@ def check_map_position(
         utm: code of the UTM zone.
         tolerance_m: largest distance between both.
         where: place in the file, for the message.
+
+    Returns:
+        Code of the zone, north or south, in which the place has this northing.
 
     Raises:
         FormatError: they are farther apart, as they are when two coordinates are swapped.
@@ -35,3 +40,7 @@ def check_map_position(
             f"expected the same place within {tolerance_m:g} m: mend the record (are two coordinates "
             "swapped?)"
         )
+    false_northings = round((xy[1] - y) / _FALSE_NORTHING_M)
+    if false_northings == 0:
+        return utm
+    return f"EPSG:{327 if false_northings > 0 else 326}{utm[-2:]}"
