@@ -144,14 +144,23 @@ def delete_reference(connection: Connection, name: str) -> bool:
     return deleted.rowcount == 1
 
 
-def best_reference(connection: Connection, outline: Array) -> ReferenceRow | None:
-    """The reference that covers most of an outline (m, 2); of equal ones, the finest."""
+def best_reference(
+    connection: Connection, outline: Array, *, has_heights: bool = False
+) -> ReferenceRow | None:
+    """The reference that covers most of an outline (m, 2); of equal ones, the finest.
+
+    Args:
+        connection: to the store.
+        outline: (m, 2) lon, lat, not closed.
+        has_heights: consider only those with a terrain.
+    """
     footprint = reference_image.c.footprint
     area = func.ST_GeomFromWKB(bindparam("area", _wkb_all_round(outline)), 4326)
     covered = func.ST_Area(func.ST_Intersection(footprint, area)) / shapely.Polygon(outline).area
+    having = [reference_image.c.dem.is_not(None)] if has_heights else []
     statement = (
         select(*COLUMNS)
-        .where(func.ST_Intersects(footprint, area))
+        .where(func.ST_Intersects(footprint, area), *having)
         .order_by(
             func.round(cast(covered, Numeric), 2).desc(),
             reference_image.c.gsd_m,

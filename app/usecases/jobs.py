@@ -50,6 +50,7 @@ from amers.app.usecases.processes import Process, Work, WorkFailed
 from amers.app.usecases.registration.job import REGISTER_SCENE
 from amers.app.usecases.registration.joint_job import REGISTER_SCENES
 from amers.app.usecases.scene_map import MAP_SCENE
+from amers.app.usecases.scene_model import READ_MODEL
 from amers.app.usecases.scene_view import VIEW_SCENE
 from amers.app.usecases.surface_job import MAKE_SURFACE
 from amers.app.usecases.vector_job import CORRECT_VECTORS, PROJECT_VECTORS
@@ -60,6 +61,7 @@ PROCESSES: dict[str, Process] = {
         REGISTER_SCENE,
         REGISTER_SCENES,
         VIEW_SCENE,
+        READ_MODEL,
         MAP_SCENE,
         ORTHORECTIFY,
         MAKE_SURFACE,

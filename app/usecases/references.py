@@ -66,7 +66,7 @@ def add_reference(connection: Connection, settings: Settings, new: NewReference)
     for name, value in (("sigma_m", new.sigma_m), ("sigma_up_m", new.sigma_up_m)):
         if value is not None and not 0.0 < value < np.inf:
             raise InputError(f"{name}: {value:g} found, more than 0 expected")
-    reference = read_reference(_reference_files(settings, new))
+    reference = read_reference(reference_files(settings, new))
     assert isinstance(reference.model, OrthoModel)
     scene = Scene(reference.image, reference.model, Acquisition(new.name), 0.0)
     image = references.NewReferenceImage(
@@ -115,7 +115,7 @@ def references_of_store(database: Database, settings: Settings) -> FindReference
                 return None
             places = references.places_inside(connection, row.id, outline, worthwhile=True)
         return CoveringReference(
-            row.name, _reference_files(settings, row), row.id, row.gsd_m, places.lon_lat_h
+            row.name, reference_files(settings, row), row.id, row.gsd_m, places.lon_lat_h
         )
 
     return find
@@ -168,7 +168,7 @@ def _mutually_apart(ecef: Array, apart_m: float) -> BoolArray:
     return is_taken
 
 
-def _reference_files(settings: Settings, reference: NewReference | ReferenceRow) -> ReferenceFiles:
+def reference_files(settings: Settings, reference: NewReference | ReferenceRow) -> ReferenceFiles:
     """The files of a reference on this machine.
 
     Raises:

@@ -111,6 +111,7 @@ def queue_jobs(dsn: str, made: Path) -> None:
             "register-scene": {"scene": flat},
             "register-scenes": {"scenes": [east, south]},
             "view-scene": {"scene": raw},
+            "read-model": {"scene": raw},
             "map-scene": {"scene": flat, "registration": done["jobID"]},
             "orthorectify": on_ground,
             "make-mosaic": {"scenes": pair, "gsd_m": 2.0, "height_m": 150.0},

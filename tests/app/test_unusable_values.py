@@ -44,6 +44,7 @@ def inputs(admin: Caller) -> dict[str, dict[str, Any]]:
         "register-scene": {"scene": scene},
         "register-scenes": {"scenes": [scene, other]},
         "view-scene": {"scene": scene},
+        "read-model": {"scene": scene},
         "map-scene": {"scene": scene, "registration": scene},
         "orthorectify": {"scene": scene, "dem": "dem.tif"},
         "make-surface": {"scenes": [scene, other]},

@@ -10,6 +10,33 @@ export interface AccuracyRecord {
   against: string;
 }
 
+export interface AdjustedMark {
+  name: string;
+  line: number;
+  sample: number;
+  lon: number;
+  lat: number;
+  height_m: number | null;
+  sigma_m: (number | null)[];
+  sigma_px: number | null;
+  residual_px: (number | null)[];
+  residual_m: number | null;
+  left_out_px: (number | null)[];
+  status: "used" | "rejected" | "in doubt" | "check";
+  note: string;
+}
+
+export interface AdjustedMarks {
+  marks: AdjustedMark[];
+  verdict: "good" | "usable" | "failed" | null;
+  relative_to_control_points: StatedAccuracy | null;
+  on_the_earth: StatedAccuracy | null;
+  words: string[];
+  next_mark: PlaceOfMarks | null;
+  places: PlaceOfMarks[];
+  terrain: string | null;
+}
+
 export interface Asset {
   href: string;
   type: string;
@@ -292,6 +319,16 @@ export interface OwnersUsage {
 export interface PartReadiness {
   status: "ok" | "degraded" | "failed";
   reason?: string;
+}
+
+export interface PlaceOfMarks {
+  line: number | null;
+  sample: number | null;
+  lon: number | null;
+  lat: number | null;
+  height_m: number | null;
+  sigma_px: number | null;
+  is_height_known: boolean;
 }
 
 export interface PointFeature {

@@ -87,6 +87,29 @@ def read_control_marks(
             raise InputError(f"{path.name}: none of its marks is switched on; switch some on")
         read.append((path, marks))
     refuse_unstated(unstated)
+    return marks_to_adjust(read, files, image, scene, may_lack=may_lack)
+
+
+def marks_to_adjust(
+    read: Sequence[tuple[Path, MarkedPoints]],
+    files: MarkFiles,
+    image: Path,
+    scene: Scene,
+    *,
+    may_lack: bool = False,
+) -> MarksOfScene:
+    """The marks of a scene, of files that were read; see `read_control_marks`.
+
+    Args:
+        read: marks with the files that they are of.
+        files: what is stated of them; its paths are not read.
+        image: of the scene; marks in other images are not used.
+        scene: of the image.
+        may_lack: whether the image may have no mark.
+
+    Raises:
+        InputError: as `read_control_marks`.
+    """
     parts = [
         _on_terrain(_completed(marks, path, files.points, image, scene), path, files)
         for path, marks in (
