@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from amers.tasks import register as register
     from amers.tasks import register_on_reference as register_on_reference
     from amers.tasks import register_together as register_together
+    from amers.tasks import straighten as straighten
     from amers.tasks import surface as surface
 
 __all__ = [
@@ -61,6 +62,7 @@ __all__ = [
     "register",
     "register_on_reference",
     "register_together",
+    "straighten",
     "surface",
 ]
 _MODULES = {
@@ -77,6 +79,7 @@ _MODULES = {
         "register",
         "register_on_reference",
         "register_together",
+        "straighten",
         "surface",
     ),
 }

@@ -36,6 +36,7 @@ from amers.app.usecases.registration.together import (
     JointPlace,
     run_joint_registration,
 )
+from amers.app.usecases.straightening import StraightenedScene, run_straightening
 from amers.app.usecases.surface import (
     SurfaceFile,
     SurfaceFiles,
@@ -359,19 +360,21 @@ def orthorectify(
     crs: str | None = None,
     gsd_m: float | None = None,
     hide: bool = False,
+    registration: FilePath | None = None,
     progress: Progress = no_progress,
 ) -> Orthorectified:
     """Write a scene with all its bands as a cloud-optimised GeoTIFF on a map.
 
     Args:
-        scene: the scene or its path. Open it with `model=` and the file of a refined model for a map in
-            the right place.
+        scene: the scene or its path.
         terrain: the terrain, or the path of one that states its vertical datum.
         output: path of the ortho-image; an existing file is replaced.
         crs: reference system of the map, such as "EPSG:32631". By default the UTM zone of the scene.
         gsd_m: ground sampling of the map, metres. By default that of the scene.
         hide: write nodata for ground that other ground hides from the sensor. By default it shows what
             hides it.
+        registration: folder of the results of `register`, whose model is used. By default that of the
+            scene, such as one opened with `model=` and the file of a refined model.
         progress: receives the fraction done and a message. By default nothing does.
 
     Raises:
@@ -385,8 +388,32 @@ def orthorectify(
         Path(output),
         ortho_map=OrthoMap(crs, gsd_m),
         options=OrthoOptions(hide=hide),
+        registration=None if registration is None else Path(registration),
         progress=progress,
     )
+
+
+def straighten(
+    scene: Scene | FilePath,
+    registration: FilePath,
+    output: FilePath,
+    *,
+    progress: Progress = no_progress,
+) -> StraightenedScene:
+    """Write a scene resampled by the motion of its lines and samples, so that an RPC carries its model.
+
+    Args:
+        scene: as delivered: the scene or its path.
+        registration: folder of the results of `register`, which found the motion.
+        output: path of the GeoTIFF; an existing file is replaced.
+        progress: receives the fraction done and a message. By default nothing does.
+
+    Raises:
+        InputError: the scene or its registration cannot be used, or its correction is affine.
+    """
+    files = _files_of(scene)
+    source = ImageFiles(files.image, files.model, files.crop_origin)
+    return run_straightening(source, Path(registration), Path(output), progress)
 
 
 def surface(

@@ -38,6 +38,7 @@ TASKS = (
     "register",
     "register_on_reference",
     "register_together",
+    "straighten",
     "surface",
 )
 OPTION = re.compile(r"^ {8}(\w+(?:, \w+)*): (.*?)(?=^ {8}\w+(?:, \w+)*: |\Z)", re.DOTALL | re.MULTILINE)

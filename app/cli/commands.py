@@ -101,6 +101,11 @@ COMMANDS: Tree = {
                 "scene_ortho:ortho",
                 "Orthorectify a scene through its model and a terrain into a cloud-optimised GeoTIFF.",
             ),
+            "straighten": Command(
+                "scene_straighten:straighten",
+                "Resample a registered scene whose lines or samples moved, so that an RPC carries its "
+                "model.",
+            ),
             "mosaic": Command(
                 "scene_mosaic:mosaic",
                 "Make an ortho-image of scenes, cut where they agree best; measure the steps at seams.",

@@ -28,6 +28,14 @@ def ortho(
     ],
     *,
     terrain: Terrain,
+    registered: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True,
+            file_okay=False,
+            help="Folder of the scene's registration; its model is used. By default the delivered one.",
+        ),
+    ] = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="GeoTIFF to write.")],
     models: ModelChoice,
     ortho_map: Annotated[OrthoMap, Shown(crs=None, gsd_m=typer.Option(min=0.001))],
@@ -46,6 +54,7 @@ def ortho(
             output,
             ortho_map=ortho_map,
             options=replace(options, kernel="cubic" if kernel == "cubic" else "bilinear"),
+            registration=registered,
             progress=progress,
         )
     show_one(asdict(orthorectified), as_json=as_json)

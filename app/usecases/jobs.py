@@ -52,6 +52,7 @@ from amers.app.usecases.registration.joint_job import REGISTER_SCENES
 from amers.app.usecases.scene_map import MAP_SCENE
 from amers.app.usecases.scene_model import READ_MODEL
 from amers.app.usecases.scene_view import VIEW_SCENE
+from amers.app.usecases.straightening import STRAIGHTEN_SCENE
 from amers.app.usecases.surface_job import MAKE_SURFACE
 from amers.app.usecases.vector_job import CORRECT_VECTORS, PROJECT_VECTORS
 
@@ -64,6 +65,7 @@ PROCESSES: dict[str, Process] = {
         READ_MODEL,
         MAP_SCENE,
         ORTHORECTIFY,
+        STRAIGHTEN_SCENE,
         MAKE_SURFACE,
         MAKE_MOSAIC,
         CORRECT_VECTORS,

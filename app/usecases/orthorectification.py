@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,7 @@ from amers.app.db.engine import Connection
 from amers.app.db.tokens import Token
 from amers.app.errors import InputError, TooLarge
 from amers.app.usecases import quotas
-from amers.app.usecases.damage import named_by_row, suspecting_damage
+from amers.app.usecases.damage import suspecting_damage
 from amers.app.usecases.processes import (
     STATEMENTS_VALUE,
     Commit,
@@ -26,23 +27,21 @@ from amers.app.usecases.processes import (
     stated_document,
 )
 from amers.app.usecases.quotas import FREE_ROOM
-from amers.app.usecases.registered_scene import REFINED_NAME
+from amers.app.usecases.registered_scene import registered_scene
 from amers.app.usecases.results import store_results
 from amers.app.usecases.scene_inputs import (
     check_file_names,
     check_scene,
     naming,
-    present_scene,
-    registration_files,
+    registered_model_keys,
 )
-from amers.app.usecases.scenes import local_image, stored_keys
+from amers.app.usecases.stored_scenes import local_scene, stored_scenes
 from amers.app.usecases.terrain_file import TerrainFile, read_terrain
 from amers.services.errors import CoverageError
 from amers.services.formats.elevation.geoid import vertical_crs
 from amers.services.formats.images.bands import one_band
 from amers.services.formats.images.ortho import BandForm, write_cog
 from amers.services.formats.images.raster import RasterImage
-from amers.services.formats.images.scenes import read_scene
 from amers.services.formats.images.tiled_image import SceneImage, TiledImage
 from amers.services.formats.sensor_models.rpc_files import ImageFiles
 from amers.services.imagery.scene import Scene, scene_gsd_m
@@ -207,6 +206,7 @@ def run_orthorectification(
     *,
     ortho_map: OrthoMap = _DEFAULT_MAP,
     options: OrthoOptions = _DEFAULT_OPTIONS,
+    registration: Path | None = None,
     limits: MapLimits | None = None,
     progress: Progress = no_progress,
 ) -> Orthorectified:
@@ -220,6 +220,8 @@ def run_orthorectification(
         output: path of the ortho-image; an existing file is replaced.
         ortho_map: reference system and ground sampling.
         options: of the orthorectification.
+        registration: folder of the scene's registration, whose model is used; by default the delivered
+            one.
         limits: of the map; None on the command line, which has none.
         progress: receives the fraction done and a message.
 
@@ -229,8 +231,7 @@ def run_orthorectification(
     """
     _check_request(ortho_map, output, (source.image, terrain.dem))
     # Each band is rectified by itself: none has to lie on another one.
-    one, origin = one_band(1), source.crop_origin
-    scene = read_scene(source.image, source.model, sigma_m=1.0, bands=one, crop_origin=origin)
+    scene, _ = registered_scene(source, registration, one_band(1))
     raster = scene.image
     assert isinstance(raster, RasterImage | TiledImage)
     ground = read_terrain(terrain)
@@ -313,45 +314,25 @@ def _check(connection: Connection, caller: Token, inputs: OrthorectifyScene) -> 
     if inputs.registration is not None:
         if inputs.model is not None:
             raise InputError("model, registration: only one of both is expected")
-        _refined_key(connection, inputs.scene, inputs.registration)
-
-
-def _refined_key(connection: Connection, scene_id: UUID, job_id: UUID) -> str:
-    """The storage key of the refined model that a registration job made of a scene.
-
-    Raises:
-        InputError: the job did not register the scene, or made no RPC.
-        Conflict: its results were removed.
-    """
-    key = registration_files(connection, scene_id, job_id).get(REFINED_NAME)
-    if key is None:
-        raise InputError(
-            f"registration: job {job_id} made no {REFINED_NAME}, because no RPC fits its refined model"
-        )
-    return key
+        registered_model_keys(connection, inputs.scene, inputs.registration)
 
 
 def _run(work: Work) -> Commit:
     """Orthorectify an uploaded scene and put the ortho-image into the storage."""
     inputs: OrthorectifyScene = work.inputs
+    jobs = [] if inputs.registration is None else [inputs.registration]
     with work.database.snapshot() as connection:
-        scene = present_scene(connection, inputs.scene)
-        refined = None
-        if inputs.registration is not None:
-            refined = _refined_key(connection, inputs.scene, inputs.registration)
+        [scene] = stored_scenes(connection, [inputs.scene], jobs)
         owner = work.job.owner
         room = None if owner is None else quotas.room_left(connection, work.settings, owner)
-    with TemporaryDirectory(prefix="amers-") as scratch, TemporaryDirectory(prefix="amers-") as folder:
-        image = local_image(work.storage, work.settings, scene, Path(scratch))
+    with ExitStack() as stack:
+        image, registration = local_scene(work, scene, stack)
+        folder = Path(stack.enter_context(TemporaryDirectory(prefix="amers-")))
         model = image.with_name(inputs.model) if inputs.model else None
-        if refined is not None:
-            with named_by_row(refined):
-                model = work.storage.fetch(refined, Path(folder))
         geoid = image.with_name(inputs.geoid) if inputs.geoid else None
-        files = [*stored_keys(scene), *([] if refined is None else [refined])]
-        with suspecting_damage(work.database, work.storage, files):
+        with suspecting_damage(work.database, work.storage, scene.keys):
             ortho = run_orthorectification(
-                ImageFiles(image, model, None if refined is None else (0.0, 0.0)),
+                ImageFiles(image, model),
                 TerrainFile(
                     image.with_name(inputs.dem),
                     inputs.vertical,
@@ -359,13 +340,14 @@ def _run(work: Work) -> Commit:
                     inputs.fill_px,
                     is_uploaded=True,
                 ),
-                Path(folder) / ORTHO_NAME,
+                folder / ORTHO_NAME,
                 ortho_map=inputs.map,
                 options=inputs.options,
+                registration=registration,
                 limits=MapLimits(room),
                 progress=work.progress,
             )
-        keys = store_results(work, {ORTHO_NAME: ortho.path})
+        stored = store_results(work, {ORTHO_NAME: ortho.path})
 
     def commit(connection: Connection) -> dict[str, Any]:
         return {
@@ -374,7 +356,7 @@ def _run(work: Work) -> Commit:
             "seen": ortho.seen,
             "error_px": ortho.error_px,
             "statements": stated_document(ortho.statements),
-            "files": keys,
+            "files": stored,
         }
 
     return commit

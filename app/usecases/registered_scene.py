@@ -7,13 +7,18 @@ from pathlib import Path
 from amers.app.errors import InputError
 from amers.app.usecases.model_choice import parse_crop_origin
 from amers.services.formats.block.reader import block_member, read_document
+from amers.services.formats.images.bands import BandMix
 from amers.services.formats.images.scenes import read_scene
-from amers.services.formats.sensor_models.correction_json import parse_correction_accuracy
+from amers.services.formats.sensor_models.correction_json import (
+    is_of_rigorous,
+    parse_correction_accuracy,
+)
 from amers.services.formats.sensor_models.refined_model import CORRECTION_JSON
+from amers.services.formats.sensor_models.rpc_files import ImageFiles
 from amers.services.formats.text_files import read_text
 from amers.services.imagery.scene import Scene
 from amers.services.quality.correction_accuracy import CorrectionAccuracy
-from amers.services.sensors.correction import CorrectedModel
+from amers.services.sensors.correction import CorrectedModel, ImageCorrection
 from amers.services.sensors.ortho import OrthoModel
 
 REFINED_NAME = "refined_RPC.TXT"
@@ -41,30 +46,67 @@ class SceneModel:
 
 
 def read_registered_scene(files: SceneModel) -> tuple[Scene, CorrectionAccuracy | None]:
-    """A scene with its registered model, and the errors of that model; None when it is not registered.
-
-    With a registration, the model is its refined RPC; where it made none, or a model is given, the
-    delivered model with the correction.
+    """As `registered_scene`, of the files that the options of a command name.
 
     Raises:
         InputError: the scene or its registration cannot be used.
     """
-    folder = files.registration
-    accuracy = None if folder is None else _read_accuracy(folder)
-    refined = None if folder is None or files.model is not None else folder / REFINED_NAME
-    uses_refined = refined is not None and refined.is_file()
     origin = None if files.crop_origin is None else parse_crop_origin(files.crop_origin)
-    scene = read_scene(
-        files.image,
-        refined if uses_refined else files.model,
-        sigma_m=1.0,
-        crop_origin=(0.0, 0.0) if uses_refined else origin,
-    )
-    if folder is not None:
+    return registered_scene(ImageFiles(files.image, files.model, origin), files.registration)
+
+
+def registered_scene(
+    source: ImageFiles, folder: Path | None, bands: BandMix | None = None
+) -> tuple[Scene, CorrectionAccuracy | None]:
+    """A scene with its registered model, and the errors of that model; None when it is not registered.
+
+    With a registration, the model is its refined RPC. Where it made none, where no RPC carries its
+    correction exactly, or a model is given, it is the delivered model with the correction.
+
+    Args:
+        source: files of the scene.
+        folder: of its registration, if it has one.
+        bands: to use; by default those of `read_scene`.
+
+    Raises:
+        InputError: the scene or its registration cannot be used.
+    """
+    if folder is None:
+        return _scene(source, bands), None
+    accuracy = _read_accuracy(folder)
+    refined = folder / REFINED_NAME
+    if source.model is None and refined.is_file() and not _is_better_corrected(folder, accuracy):
+        scene = _scene(ImageFiles(source.image, refined, (0.0, 0.0)), bands)
         _check_size(folder, scene)
-    if accuracy is not None and not uses_refined:
-        scene = replace(scene, model=CorrectedModel(scene.model, accuracy.correction))
-    return scene, accuracy
+        return scene, accuracy
+    scene = _scene(source, bands)
+    _check_size(folder, scene)
+    return replace(scene, model=CorrectedModel(scene.model, accuracy.correction)), accuracy
+
+
+def delivered_and_correction(
+    source: ImageFiles, folder: Path, bands: BandMix | None = None
+) -> tuple[Scene, ImageCorrection]:
+    """A scene with its delivered model, and the correction of its registration.
+
+    Args:
+        source: files of the scene.
+        folder: of its registration.
+        bands: to use; by default those of `read_scene`.
+
+    Raises:
+        InputError: the scene or its registration cannot be used, or the correction is that of a rigorous
+            model, whose parameters are not in its files.
+    """
+    accuracy = _read_accuracy(folder)
+    if _is_of_rigorous(folder):
+        raise InputError(
+            f"{folder / CORRECTION_JSON}: corrects a rigorous model, a correction of the delivered RPC "
+            "expected: register the scene without --rigorous"
+        )
+    scene = _scene(source, bands)
+    _check_size(folder, scene)
+    return scene, accuracy.correction
 
 
 def read_raw_scene(files: SceneModel) -> tuple[Scene, CorrectionAccuracy | None]:
@@ -105,6 +147,24 @@ def _read_accuracy(folder: Path) -> CorrectionAccuracy:
             "`amers scene register -o` writes it"
         )
     return parse_correction_accuracy(read_text(path), str(path))
+
+
+def _scene(source: ImageFiles, bands: BandMix | None) -> Scene:
+    origin = source.crop_origin
+    return read_scene(source.image, source.model, sigma_m=1.0, bands=bands, crop_origin=origin)
+
+
+def _is_better_corrected(folder: Path, accuracy: CorrectionAccuracy) -> bool:
+    """Whether the delivered model with the correction is closer than the refined RPC of a registration.
+
+    No RPC carries a displacement of lines and samples.
+    """
+    return accuracy.correction.displacement is not None and not _is_of_rigorous(folder)
+
+
+def _is_of_rigorous(folder: Path) -> bool:
+    path = folder / CORRECTION_JSON
+    return is_of_rigorous(read_text(path), str(path))
 
 
 def _check_size(folder: Path, scene: Scene) -> None:

@@ -54,6 +54,10 @@ class DisplacementGrid:
         means = self.at(places).reshape(2, _AVERAGED, -1, 2).mean(axis=1)
         return np.asarray(means[0] + means[1] - self.at(line_sample))
 
+    def beside_breaks(self, line_sample: Array) -> Array:
+        """The same positions (n, 2), but off the breaks: those within a line of one move to its side."""
+        return self._before_breaks(line_sample, 0.0)
+
     def _before_breaks(self, line_sample: Array, offset: float) -> Array:
         """Positions (n, 2) some lines away, or at the break that lies between."""
         line = line_sample[:, 0] + offset

@@ -18,6 +18,7 @@ from amers.app.db import engine
 from amers.app.db.cluster.embedded import Cluster
 from amers.app.db.jobs.jobs import Job
 from amers.app.main import create_app
+from amers.app.storage import Storage
 from amers.app.usecases.jobs import PROCESSES
 from amers.app.usecases.tokens import create_token
 from amers.app.worker.attempt import Attempts
@@ -27,6 +28,7 @@ from tests.app.conftest import EMPTY_TEMPLATE
 from tests.app.flat_world import CENTRE, SIGMA_M
 from tests.app.job_queue import state_of
 from tests.app.ledger import job_runner
+from tests.app.moved_lines import jittered, registration, stored_registration
 from tests.app.session_relay import Ending, Relay, relayed
 from tests.app.store_commands import Installations, Place, fill, settings_of
 from tests.app.surface_world import write_pair
@@ -103,6 +105,9 @@ def queue_jobs(dsn: str, made: Path) -> None:
             laid = client.put(f"/scenes/{raw}/files/{path.name}", content=path.read_bytes(), headers=me)
             assert laid.status_code == 200, laid.text
         run = job_runner(client, database, settings, me)
+        moved = stored_registration(
+            dsn, Storage(settings.data_folder / "storage"), raw, registration(made / "moved", jittered())
+        )
         done = run("register-scene", scene=flat, options={"max_points": 0})
         assert done["status"] == "successful", done
         box = [*(CENTRE - 0.1), *(CENTRE + 0.1)]
@@ -114,6 +119,7 @@ def queue_jobs(dsn: str, made: Path) -> None:
             "read-model": {"scene": raw},
             "map-scene": {"scene": flat, "registration": done["jobID"]},
             "orthorectify": on_ground,
+            "straighten-scene": {"scene": raw, "registration": moved},
             "make-mosaic": {"scenes": pair, "gsd_m": 2.0, "height_m": 150.0},
             "make-surface": {"scenes": pair, "gsd_m": 2.0, "heights_m": [140.0, 180.0]},
             "correct-vectors": {**on_ground, "vectors": pixels.name, "sigma_m": SIGMA_M},

@@ -19,7 +19,6 @@ from amers.app.cli.main import app
 from amers.app.config import Settings
 from amers.app.db import engine, scenes
 from amers.app.db.engine import Database
-from amers.app.db.jobs import jobs
 from amers.app.errors import AmersError, InputError
 from amers.app.storage import Storage
 from amers.app.usecases.jobs import do_attempt
@@ -29,8 +28,9 @@ from amers.services.geodesy import metres_per_degree
 from amers.services.sensors.rpc import RpcModel
 from amers.services.types import Acquisition
 from tests.app.callers import Bearer
-from tests.app.job_queue import claim, store_registration
+from tests.app.job_queue import claim
 from tests.app.ledger import job_runner, make_token
+from tests.app.moved_lines import registration, shifted, stored_registration
 
 MODEL = parse_rpc_text((Path(__file__).parents[1] / "golden" / "invented_RPC.TXT").read_text())
 a_pixel = 1.0
@@ -175,17 +175,12 @@ def test_a_service_rectifies_a_scene_on_a_terrain_uploaded_beside_it(
     with rasterio.open(tmp_path / "served.tif") as ours, rasterio.open(tmp_path / "own.tif") as own:
         assert (ours.crs, ours.transform) == (own.crs, own.transform)
         np.testing.assert_array_equal(ours.read(), own.read())
-    (tmp_path / "refined_RPC.TXT").write_text(format_rpc_text(in_the_image(lines_off=20)))
-    key = storage.put_file("results/a/1/refined_RPC.TXT", tmp_path / "refined_RPC.TXT").key
-    with engine.connect(dsn) as connection:
-        job = jobs.create(connection, "register-scene", {})
-        assert job is not None
-        store_registration(
-            connection, job_id=job.id, scene_id=UUID(scene), files={"refined_RPC.TXT": key}
-        )
-    refined = me.get(outcome(vertical="ellipsoid", registration=str(job.id))["ortho.tif"]["href"])
+    folder = registration(tmp_path / "registered", shifted(20.0))
+    (folder / "refined_RPC.TXT").write_text(format_rpc_text(in_the_image(lines_off=20)))
+    job = stored_registration(dsn, storage, scene, folder)
+    refined = me.get(outcome(vertical="ellipsoid", registration=job)["ortho.tif"]["href"])
     (tmp_path / "refined.tif").write_bytes(refined.content)
-    words = ["--dem", dem, "--vertical", "ellipsoid", "--model", tmp_path / "refined_RPC.TXT"]
+    words = ["--dem", dem, "--vertical", "ellipsoid", "--model", folder / "refined_RPC.TXT"]
     ortho(image, *words, "-o", tmp_path / "own_refined.tif")
     with (
         rasterio.open(tmp_path / "refined.tif") as ours,

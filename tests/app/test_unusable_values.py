@@ -47,6 +47,7 @@ def inputs(admin: Caller) -> dict[str, dict[str, Any]]:
         "read-model": {"scene": scene},
         "map-scene": {"scene": scene, "registration": scene},
         "orthorectify": {"scene": scene, "dem": "dem.tif"},
+        "straighten-scene": {"scene": scene, "registration": scene},
         "make-surface": {"scenes": [scene, other]},
         "make-mosaic": {"scenes": [scene, other]},
         "correct-vectors": {"scene": scene, "vectors": "a.geojson", "dem": "dem.tif"},

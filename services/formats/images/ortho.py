@@ -1,4 +1,4 @@
-"""Writing ortho-images: rectified scenes, and delivered images with a corrected map grid."""
+"""Writing images that were resampled, on a map or straightened, and corrected map grids."""
 
 import shutil
 from collections.abc import Iterable
@@ -17,11 +17,13 @@ from amers.services.errors import FormatError
 from amers.services.formats.images.datasets import GDAL_OPTIONS, as_format_error
 from amers.services.formats.images.raster import (
     GDAL_FIRST_PIXEL,
+    gdal_rpc,
     map_grid_of,
     open_raster,
 )
 from amers.services.map_grid import MapGrid
 from amers.services.orthorectification.rectify import OrthoWindow
+from amers.services.sensors.rpc import RpcModel
 from amers.services.types import FloatImage
 
 
@@ -101,15 +103,30 @@ class BandForm:
     overviews: str = "AVERAGE"
 
 
-def write_cog(path: Path, grid: MapGrid, windows: Iterable[OrthoWindow], form: BandForm) -> float:
-    """Write an ortho-image as a cloud-optimised GeoTIFF with overviews, window by window.
+@dataclass(frozen=True)
+class SensorGrid:
+    """The pixels of an image in the geometry of its sensor.
+
+    Attributes:
+        shape: lines and samples.
+        model: of the image.
+    """
+
+    shape: tuple[int, int]
+    model: RpcModel
+
+
+def write_cog(
+    path: Path, grid: MapGrid | SensorGrid, windows: Iterable[OrthoWindow], form: BandForm
+) -> float:
+    """Write an image as a cloud-optimised GeoTIFF with overviews, window by window.
 
     Integer pixels are rounded and clipped to the range of their type; a valid pixel never has the values
     `nodata` and `saturated`.
 
     Args:
         path: the file; an existing one is replaced when the new one is complete.
-        grid: the map grid.
+        grid: the map grid, or the geometry of a raw image, whose model becomes RPC tags.
         windows: all windows of the grid, in any order.
         form: of the bands.
 
@@ -142,16 +159,17 @@ def write_cog(path: Path, grid: MapGrid, windows: Iterable[OrthoWindow], form: B
     return error_px
 
 
-def _profile(grid: MapGrid, form: BandForm) -> dict[str, Any]:
+def _profile(grid: MapGrid | SensorGrid, form: BandForm) -> dict[str, Any]:
     """How a GeoTIFF in tiles is created."""
-    return {
+    place: dict[str, Any] = {}
+    if isinstance(grid, MapGrid):
+        place = {"crs": grid.crs, "transform": gdal_transform(grid)}
+    return place | {
         "driver": "GTiff",
         "height": grid.shape[0],
         "width": grid.shape[1],
         "count": form.bands,
         "dtype": form.dtype,
-        "crs": grid.crs,
-        "transform": gdal_transform(grid),
         "nodata": form.nodata,
         "tiled": True,
         "blockxsize": 512,
@@ -160,10 +178,14 @@ def _profile(grid: MapGrid, form: BandForm) -> dict[str, Any]:
     }
 
 
-def _write_windows(path: Path, windows: Iterable[OrthoWindow], grid: MapGrid, form: BandForm) -> float:
+def _write_windows(
+    path: Path, windows: Iterable[OrthoWindow], grid: MapGrid | SensorGrid, form: BandForm
+) -> float:
     """Write the windows into a new file; returns their largest error."""
     error_px = 0.0
     with rasterio.open(path, "w", **_profile(grid, form)) as file:
+        if isinstance(grid, SensorGrid):
+            file.rpcs = gdal_rpc(grid.model)
         for band, name in enumerate(form.names, start=1):
             file.set_band_description(band, name)
         for band, unit in enumerate(form.units, start=1):

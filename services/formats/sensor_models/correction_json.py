@@ -2,7 +2,8 @@
 
 With `t = ((line, sample) - centre) / half_size`, a position of the delivered model moves by
 `parameters (1, t_line, t_sample)`, and by a displacement on a grid where there is one: bilinear between
-nodes, constant beyond them. The centre of the first pixel is (0, 0).
+nodes, constant beyond them. It jumps at the lines `breaks`, where lines of the image were lost or
+repeated. The centre of the first pixel is (0, 0).
 """
 
 import json
@@ -25,6 +26,8 @@ PROFILE_FORMAT = "amers-image-correction/2"
 """Of a correction by line, as it was written before grids were; it is read only."""
 GRID_FORMAT = "amers-image-correction/3"
 """Of a correction on a grid: a reader that does not know it must not take the affine part alone."""
+OF_RIGOROUS = "rigorous model"
+"""How `applies_to` begins for the correction of an adjusted rigorous model."""
 
 _PROFILE = {
     "displacement_px": (2,),
@@ -81,6 +84,7 @@ def format_correction(
             "displacement_px": grid.displacement_px.round(_DECIMALS).tolist(),
             "variance_px2": grid.variance_px2.round(_DECIMALS).tolist(),
             "position_variance_px2": _at_nodes(stated, grid),
+            "breaks": grid.breaks.tolist(),
         }
     if held is not None:
         document["held_outline_px"] = [ring.round(_HELD_DECIMALS).tolist() for ring in held]
@@ -132,6 +136,12 @@ def parse_correction(text: str, source: str = "correction") -> ImageCorrection:
     return correction
 
 
+def is_of_rigorous(text: str, source: str = "correction") -> bool:
+    """Whether the correction of a document applies to a rigorous model, not to the delivered RPC."""
+    document = load_json(text, source)
+    return isinstance(document, dict) and str(document.get("applies_to")).startswith(OF_RIGOROUS)
+
+
 def parse_correction_accuracy(text: str, source: str = "correction") -> CorrectionAccuracy:
     """The correction of a JSON document with the covariance of its errors.
 
@@ -166,7 +176,10 @@ def _grid(document: dict[str, Any], source: str) -> DisplacementGrid:
     nodes = [_ascending(grid, name, place) for name in ("line", "sample")]
     shape = (len(nodes[0]), len(nodes[1]), 2)
     values = [_numbers(grid, name, shape, place) for name in ("displacement_px", "variance_px2")]
-    return DisplacementGrid(*nodes, *values)
+    jumps = grid.get("breaks", [])
+    count = len(jumps) if isinstance(jumps, list) else 0
+    breaks = _numbers({"breaks": jumps}, "breaks", (count,), place)
+    return DisplacementGrid(nodes[0], nodes[1], values[0], values[1], breaks)
 
 
 def _ascending(nodes: dict[str, Any], name: str, source: str) -> Array:

@@ -8,7 +8,7 @@ from pathlib import Path
 from amers.services.formats.images.ortho import write_refined_ortho
 from amers.services.formats.images.tiled_image import TiledImage
 from amers.services.formats.sensor_models.attitude_csv import ATTITUDE_CSV, format_attitude
-from amers.services.formats.sensor_models.correction_json import format_correction
+from amers.services.formats.sensor_models.correction_json import OF_RIGOROUS, format_correction
 from amers.services.formats.sensor_models.product_image import open_image
 from amers.services.formats.sensor_models.rpc_files import (
     DeliveredModel,
@@ -165,7 +165,7 @@ def _write_model(
         delivered = _delivered_rpc(*source)
         model_files = _write_fitted(delivered, model, shape, folder, copied)
         applies_to = (
-            f"rigorous model of {image_path.name}: the nearest correction to the adjusted one, "
+            f"{OF_RIGOROUS} of {image_path.name}: the nearest correction to the adjusted one, "
             f"{model.correction_error_px:.2g} px off it at most"
         )
     elif isinstance(model, CorrectedModel) and isinstance(base, OrthoModel):
@@ -193,8 +193,8 @@ def _write_rpc(
         note = (
             f"no refined RPC is written: the nearest is up to {refined.max_error_px:.2g} px off, more "
             f"than the CE90 of {stated_px:.2g} px that is stated relative to the control points; no RPC "
-            f"follows lines and samples so. Use {CORRECTION_JSON} with the delivered model, or an "
-            "orthorectified image"
+            f"follows lines and samples so. Use the image that "
+            f"`amers scene straighten` makes, or {CORRECTION_JSON} with the delivered model"
         )
         return RefinedFiles((), refined.max_error_px, note)
     if refined.model is None:
@@ -210,7 +210,8 @@ def _write_rpc(
     if refined.max_error_px > LOUD_PX:
         how = (
             f"up to {refined.max_error_px:.2g} px OFF: no RPC follows lines and samples so. Use "
-            f"{CORRECTION_JSON} with the delivered model, or an orthorectified image"
+            "the image that `amers scene straighten` makes, or "
+            f"{CORRECTION_JSON} with the delivered model"
         )
     return RefinedFiles(tuple(files), refined.max_error_px, f"{names}: the corrected model, {how}")
 

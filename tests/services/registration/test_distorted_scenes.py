@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 from amers.services.errors import BrokenImage, NotEnoughPoints, TurnedImage
+from amers.services.imagery.source import ArrayImage
+from amers.services.orthorectification.straighten import straighten, without_displacement
 from amers.services.quality.normal_law import normal_ce90
 from amers.services.registration.on_points import Registration, register_scene
+from amers.services.sensors.correction import CorrectedModel
 from amers.services.simulation.distortion import (
     Bend,
     DistortedImage,
@@ -168,3 +171,26 @@ def test_ground_that_moved_in_the_middle_is_not_taken_for_the_scene(name: str) -
     assert on_it.mean() < 0.1
     assert result.qualification.verdict in ("usable", "failed")
     assert ratio(name) < WRONG
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", ["jitter", "bow", "lost lines"])
+def test_a_straightened_image_fits_an_rpc_when_it_is_registered_again(name: str) -> None:
+    """On the same points, nothing is left to follow, and its affine model is where they are."""
+    first = registered(name)
+    assert isinstance(first.model, CorrectedModel)
+    view = view_of(FIRST)
+    image = DistortedImage(view.image, distortion(name))
+    out = np.full(shape(), np.nan, dtype=np.float32)
+    for one in straighten([image], first.model.correction):
+        w = one.window
+        out[w.line : w.line + w.lines, w.sample : w.sample + w.samples] = one.pixels[0]
+    model = CorrectedModel(first.model.base, without_displacement(first.model.correction))
+    scene = replace(view.as_scene(SIGMA_M), image=ArrayImage(out), model=model)
+    again = register_scene(scene, *block())
+    assert not again.adjustment.components
+    assert again.qualification.verdict in ("good", "usable")
+    pixel = np.stack(np.meshgrid(*(np.linspace(0.1, 0.9, 9) * n for n in shape()), indexing="ij"), -1)
+    moved = again.adjustment.correction.apply(pixel.reshape(-1, 2)) - pixel.reshape(-1, 2)
+    stated_px = normal_ce90(first.adjustment.covariance_at(pixel.reshape(-1, 2)))
+    assert np.quantile(np.hypot(*moved.T) / stated_px, 0.9) < 1.5
