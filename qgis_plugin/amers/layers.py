@@ -38,7 +38,7 @@ def points_layer(service: Service) -> QgsVectorLayer:
 
 
 def registration_layers(image: Path, folder: Path) -> list[QgsMapLayer]:
-    """The results of a registration, the lowest layer first: image on the map, residuals, points.
+    """The results of a registration, the lowest layer first: image, held area, residuals, points.
 
     The styles of the vectors are those in their file. There is no image on the map where the
     registration has no RPC.
@@ -53,6 +53,10 @@ def registration_layers(image: Path, folder: Path) -> list[QgsMapLayer]:
     points = _vector_layer(folder, "control_points")
     residuals = _vector_layer(folder, "residuals")
     layers: list[QgsMapLayer] = [residuals, points]
+    held = QgsVectorLayer(f"{folder / 'residuals.gpkg'}|layername=held_area", "held area", "ogr")
+    if held.isValid():
+        # Services before 0.1 state no area.
+        layers.insert(0, held)
     if (folder / "refined_RPC.TXT").exists():
         heights = (feature["height_m"] for feature in points.getFeatures("\"status\" = 'active'"))
         layers.insert(0, _image_on_map(image, folder, fmean(heights)))

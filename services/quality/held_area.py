@@ -88,11 +88,12 @@ class HeldArea:
         return shapely.transform(cells, lambda xy: xy * size - 0.5)
 
     @property
-    def rings(self) -> tuple[Array, ...]:
-        """The outline as closed rings (n, 2) of line and sample, each followed by its holes."""
-        polygons = shapely.get_parts(self.outline)
-        rings = [ring for one in polygons for ring in (one.exterior, *one.interiors)]
-        return tuple(np.asarray(ring.coords)[:, ::-1] for ring in rings)
+    def polygons(self) -> tuple[tuple[Array, ...], ...]:
+        """The outline as polygons of closed rings (n, 2) of line and sample, the outer one first."""
+        return tuple(
+            tuple(np.asarray(ring.coords)[:, ::-1] for ring in (one.exterior, *one.interiors))
+            for one in shapely.get_parts(self.outline)
+        )
 
     def nearest(self, line_sample: Array) -> Array:
         """Places (n, 2), each moved to the nearest that is held; as they are where none is."""

@@ -22,6 +22,7 @@ from amers.services.quality.stability import (
     measure_stability,
     residuals_in_image,
 )
+from amers.services.sensors.base import SensorModel
 from amers.services.types import Array, BoolArray, Frame, Measures
 
 _ENOUGH_RESIDUALS = 6
@@ -139,12 +140,15 @@ class Coverage:
         reach_px: of a point.
         outline: rings of the area that is held, (n, 2) line and sample each, closed; holes follow the
             rings that surround them.
+        polygons_lon_lat: the same on the ground, at the median height of the active points, degrees:
+            coordinates of a GeoJSON MultiPolygon. Longitudes are continuous.
     """
 
     cells: Array
     percent: float
     reach_px: float
     outline: tuple[Array, ...]
+    polygons_lon_lat: tuple[tuple[Array, ...], ...]
 
     def holds(self, line_sample: Array) -> BoolArray:
         """Which places (n, 2) of the image are held."""
@@ -229,7 +233,9 @@ def qualify_repeated(
         residual_std_px = shown_residual_std_px = tie_residual_px
     predicted = predict_accuracy(scene, options.grid)
     assert scene.held is not None
-    coverage = image_coverage(measures.line_sample[measures.active], scene.held, options.coverage_cells)
+    coverage = image_coverage(
+        scene.model, measures.take(measures.active), scene.held, options.coverage_cells
+    )
     figures = _Figures(
         active_points=point_counts.active,
         active_of_matched=point_counts.active_of_matched,
@@ -305,11 +311,30 @@ def _residuals_on_ground(residual_m: Array) -> GroundResiduals:
     return GroundResiduals(statistics(east), statistics(north), statistics(np.hypot(east, north)))
 
 
-def image_coverage(line_sample: Array, held: HeldArea, cells: int) -> Coverage:
-    """The area that points hold, and numbers of active points (n, 2) in `cells` x `cells` parts."""
+def image_coverage(model: SensorModel, active: Measures, held: HeldArea, cells: int) -> Coverage:
+    """The area that points hold, and numbers of active points in `cells` x `cells` parts.
+
+    Args:
+        model: of the registered scene, for the area on the ground.
+        active: measures of the active points.
+        held: the area.
+        cells: along each side of the image.
+    """
     edges = [np.linspace(-0.5, size - 0.5, cells + 1) for size in held.shape]
-    counts, _, _ = np.histogram2d(line_sample[:, 0], line_sample[:, 1], bins=edges)
-    return Coverage(counts, held.percent, held.reach_px, held.rings)
+    counts, _, _ = np.histogram2d(active.line_sample[:, 0], active.line_sample[:, 1], bins=edges)
+    on_ground: tuple[tuple[Array, ...], ...] = ()
+    if len(active.lon_lat_h):
+        height_m = float(np.median(active.lon_lat_h[:, 2]))
+        on_ground = tuple(
+            tuple(_on_ground(model, ring, height_m) for ring in polygon) for polygon in held.polygons
+        )
+    rings = tuple(ring for polygon in held.polygons for ring in polygon)
+    return Coverage(counts, held.percent, held.reach_px, rings, on_ground)
+
+
+def _on_ground(model: SensorModel, line_sample: Array, height_m: float) -> Array:
+    """Longitudes and latitudes (n, 2) of image positions (n, 2) at a height."""
+    return model.locate(line_sample, np.full(len(line_sample), height_m))[:, :2]
 
 
 @dataclass(frozen=True)

@@ -47,13 +47,20 @@ def asked(connection: Connection, owner: UUID, *scene_ids: UUID) -> UUID:
     return job.id
 
 
+RING = [[5.0, 43.0], [5.1, 43.0], [5.1, 43.1], [5.0, 43.0]]
+
+
 def registered(connection: Connection, job_id: UUID, scene_id: UUID, verdict: str) -> None:
     """Store the registration of a scene, whose report and files have the name of its job."""
     store_registration(
         connection,
         job_id=job_id,
         scene_id=scene_id,
-        report={"verdict_scope": str(job_id), "on_the_earth": {"ce90_m": 2.0}},
+        report={
+            "verdict_scope": str(job_id),
+            "on_the_earth": {"ce90_m": 2.0},
+            "coverage": {"percent": 81.5, "polygons_lon_lat": [[RING]]},
+        },
         verdict=verdict,
         files={"report.json": f"results/{job_id}/1/report.json"},
     )
@@ -156,6 +163,7 @@ def test_the_files_of_a_scene_are_those_of_its_last_registration_that_has_files_
     assert files.results == {"report.json": f"results/{newer}/1/report.json"}
     assert files.accuracy is not None
     assert files.accuracy["verdict_scope"] == str(newer)
+    assert (files.accuracy["held_percent"], files.accuracy["held_polygons"]) == (81.5, [[RING]])
     run_sql(connection, "update job set results_removed_at = now() where id = %s", [newer])
     files = files_of(connection, scene)
     assert (files.job_id, files.results) == (older, {"report.json": f"results/{older}/1/report.json"})

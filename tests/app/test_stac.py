@@ -9,12 +9,14 @@ from uuid import UUID
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
+from shapely.geometry import shape
 
 from amers.app.config import Settings
 from amers.app.db import engine, scenes
 from amers.app.main import create_app
 from amers.services.types import Acquisition
 from tests.app.callers import Bearer, Caller
+from tests.app.job_queue import store_registration
 
 ITEMS = "/collections/scenes/items"
 TAKEN = datetime(2024, 6, 21, 10, 30, tzinfo=UTC)
@@ -179,3 +181,14 @@ def test_a_scene_on_the_server_is_taken_where_it_lies(
     with TestClient(create_app(settings)) as client:
         closed = client.post("/scenes/reference", json={"path": "2024/a.tif"}, headers=me)
         assert "AMERS_SCENE_FOLDER" in closed.json()["detail"]
+
+
+def test_an_item_of_a_registered_scene_has_the_area_for_which_accuracy_is_stated(item, scene, dsn):
+    ring = [[5.0, 43.0], [5.1, 43.0], [5.1, 43.1], [5.0, 43.0]]
+    coverage = {"percent": 81.5, "polygons_lon_lat": [[ring]]}
+    with engine.connect(dsn) as connection:
+        store_registration(connection, scene_id=UUID(scene), report={"coverage": coverage})
+    properties = item()["properties"]
+    assert properties["amers:held_percent"] == 81.5
+    assert shape(properties["amers:held_area"]).area == pytest.approx(0.005)
+    assert "amers:held_polygons" not in properties

@@ -93,6 +93,8 @@ def test_a_scene_goes_from_upload_to_report_with_the_keyboard_alone(visit, world
     assert f"{found['visible']}, {found['matched']}, {found['active']}" in figures
     assert page.locator(".badge").first.inner_text() == report["verdict"]
     assert page.locator("tbody tr").count() == len(report["criteria"])
+    share = report["coverage"]["percent"]
+    expect(page.get_by_text("Accuracy is stated for the shaded part")).to_contain_text(f"{share:.2g}")
     assert until(lambda: vectors_drawn_px(page) >= enough_px)
     until_drawn(page)
     look(page, "journey-3-registered")

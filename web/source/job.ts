@@ -1,6 +1,6 @@
 // A job: its progress while it runs, its error if it failed, its report if it was successful.
 
-import type { FeatureCollection, Point, Polygon, Position } from "geojson";
+import type { Feature, FeatureCollection, Point, Polygon, Position } from "geojson";
 import { blobUrl, call, get } from "./api";
 import type { Atlas } from "./atlas";
 import { drawBlocks } from "./blocks";
@@ -100,10 +100,11 @@ async function showResults(place: Place, job: StatusInfo, heading: HTMLElement, 
   const ring = report.scene.footprint_lon_lat as Position[];
   const footprint: Polygon = { type: "Polygon", coordinates: [[...ring, ring[0]!]] };
   const { features, exaggeration } = residualVectors(points);
+  const held: Feature = { type: "Feature", properties: { status: "held" }, geometry: { type: "MultiPolygon", coordinates: (report.coverage.polygons_lon_lat ?? []) as Position[][][] } };
   heading.textContent = report.scene.name;
   fill(body, ...summary(report, exaggeration), drawingLink(job), imageOnMap(place, job, report), ...criteria(report), await downloads(results, signal));
   signal.addEventListener("abort", () => void atlas.show("vectors", []));
-  await Promise.all([atlas.show("scenes", [{ type: "Feature", properties: {}, geometry: footprint }]), atlas.show("vectors", features)]);
+  await Promise.all([atlas.show("scenes", [{ type: "Feature", properties: {}, geometry: footprint }]), atlas.show("vectors", [held, ...features])]);
   atlas.fit(footprint, 17);
 }
 
@@ -146,6 +147,7 @@ function summary(report: Report, exaggeration: number): (HTMLElement | null)[] {
       "Predicted CE90 relative to the control points, worst place": figure(predicted.worst_px, "px"),
     }),
     h("p", { class: "legend-line" }, h("span", { class: "swatch vector", "aria-hidden": "true" }), `Residuals on the map, drawn ${figure(exaggeration)} times longer; grey: not used.`),
+    h("p", { class: "quiet" }, `Accuracy is stated for the shaded part of the map, ${figure(report.coverage.percent, "%")} of the image, which the points hold.`),
   ];
 }
 

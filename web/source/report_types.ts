@@ -101,6 +101,7 @@ export interface Coverage {
   percent: number | null;
   reach_px: number | null;
   outline: Numbers[][];
+  polygons_lon_lat: Numbers[][][];
 }
 
 export interface Criterion {

@@ -218,7 +218,7 @@ function layers(dark: boolean, colouring: Colouring): LayerSpecification[] {
       type: "fill",
       source: "vectors",
       filter: ["in", ["geometry-type"], ["literal", ["Polygon", "MultiPolygon"]]],
-      paint: { "fill-color": c.active, "fill-opacity": 0.12 },
+      paint: { "fill-color": ["case", ["==", ["get", "status"], "held"], c.scene, c.active], "fill-opacity": 0.12 },
     },
     {
       id: "vectors",
@@ -226,7 +226,7 @@ function layers(dark: boolean, colouring: Colouring): LayerSpecification[] {
       source: "vectors",
       filter: ["!", ["in", ["geometry-type"], ["literal", ["Point", "MultiPoint"]]]],
       layout: { "line-cap": "round" },
-      paint: { "line-color": ["case", ["==", ["get", "status"], "active"], c.active, c.quiet], "line-width": 1.8 },
+      paint: { "line-color": ["match", ["get", "status"], "active", c.active, "held", c.scene, c.quiet], "line-width": ["case", ["==", ["get", "status"], "held"], 1, 1.8] },
     },
     {
       id: "vector-points",

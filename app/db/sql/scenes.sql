@@ -10,7 +10,9 @@ select s.id as scene_id,
     (select jsonb_build_object(
             'verdict_scope', l.report->'verdict_scope',
             'relative_to_control_points', l.report->'relative_to_control_points',
-            'on_the_earth', l.report->'on_the_earth')
+            'on_the_earth', l.report->'on_the_earth',
+            'held_percent', l.report->'coverage'->'percent',
+            'held_polygons', l.report->'coverage'->'polygons_lon_lat')
         from registration l where l.scene_id = s.id
         order by l.created_at desc limit 1) as accuracy
 from scene s left join lateral (

@@ -90,10 +90,15 @@ def _properties(columns: dict[str, Any]) -> dict[str, Any]:
 
 
 def _accuracy(files: SceneFiles) -> dict[str, Any]:
-    """The accuracy that the last registration states, as in its report; unknown figures are null."""
-    return {
-        f"amers:{name}": stated for name, stated in (files.accuracy or {}).items() if stated is not None
-    }
+    """The accuracy that the last registration states, as in its report; unknown figures are null.
+
+    `amers:held_area` is the ground for which it is stated, a geometry of GeoJSON.
+    """
+    stated = {name: value for name, value in (files.accuracy or {}).items() if value is not None}
+    polygons = stated.pop("held_polygons", None)
+    if polygons is not None:
+        stated["held_area"] = {"type": "MultiPolygon", "coordinates": polygons}
+    return {f"amers:{name}": value for name, value in stated.items()}
 
 
 def _bbox(geometry: dict[str, Any] | None) -> list[float] | None:

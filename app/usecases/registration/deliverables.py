@@ -28,7 +28,7 @@ OUTPUTS = {
     "control_points_pci.txt": "The control points as a text file for the OrthoEngine of PCI.",
     "control_points_opf.json": "The active control points as OPF 1.0.",
     "gcp_list.txt": "The active control points for OpenDroneMap.",
-    "residuals.gpkg": "Residual vectors and control points as layers of a GeoPackage.",
+    "residuals.gpkg": "Residual vectors, control points and the held area as layers of a GeoPackage.",
     "correction.json": "The correction, for every kind of sensor model.",
     "refined_RPC.TXT": "The refined model as RPC text, in the pixels of the image, unless none fits.",
 }
@@ -62,7 +62,8 @@ def write_outputs(
     geojson = format_measures(measures, image, sigma_m)
     texts = {"control_points.geojson": geojson, **_exchange_formats(marks)}
     layers = folder / "residuals.gpkg"
-    write_residual_layers(layers, measures, image, exaggeration_for(measures))
+    held = report.coverage.polygons_lon_lat
+    write_residual_layers(layers, measures, image, exaggeration_for(measures), held)
     return {**files, **write_texts(folder, texts), layers.name: layers}
 
 

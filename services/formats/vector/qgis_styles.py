@@ -18,6 +18,8 @@ from amers.services.conventions import STATUS_COLOURS
 
 COLOURS = ("#440154", "#3b528b", "#21918c", "#5ec962", "#fde725")
 """Viridis, of the classes of a number; readable with every colour vision."""
+_PALE = 30
+"""Opacity of areas, of 255."""
 TABLE = """
 CREATE TABLE layer_styles (
     id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL,
@@ -76,7 +78,22 @@ class WordStyle:
     symbol: Literal["disc", "arrow"]
 
 
-Style: TypeAlias = NumberStyle | WordStyle
+@dataclass(frozen=True)
+class AreaStyle:
+    """An area with an outline.
+
+    Attributes:
+        name: as QGIS lists it.
+        description: what the area is.
+        colour: of the outline, and of the area, which one sees through.
+    """
+
+    name: str
+    description: str
+    colour: str
+
+
+Style: TypeAlias = NumberStyle | WordStyle | AreaStyle
 
 LAYER_STYLES: Mapping[str, Sequence[Style]] = {
     "points": (
@@ -89,6 +106,13 @@ LAYER_STYLES: Mapping[str, Sequence[Style]] = {
         ),
         NumberStyle(
             "Number of views", "Images that see the point", '"n_views"', (0, 2, 4, 6, 9, 1e6), ""
+        ),
+    ),
+    "held_area": (
+        AreaStyle(
+            "Held area",
+            "The area that control points hold: accuracy is stated for it, and for no other part",
+            STATUS_COLOURS["active"],
         ),
     ),
     "control_points": (
@@ -128,6 +152,8 @@ def as_qml(style: Style) -> str:
     root = ET.Element("qgis", version="3.22", styleCategories="Symbology")
     if isinstance(style, NumberStyle):
         _add_ranges(root, style)
+    elif isinstance(style, AreaStyle):
+        _add_area(root, style)
     else:
         _add_categories(root, style)
     return ET.tostring(root, encoding="unicode")
@@ -162,6 +188,14 @@ def _add_categories(root: ET.Element, style: WordStyle) -> None:
         add_symbol(symbols, str(number), colour)
 
 
+def _add_area(root: ET.Element, style: AreaStyle) -> None:
+    renderer = ET.SubElement(root, "renderer-v2", type="singleSymbol")
+    symbols = ET.SubElement(renderer, "symbols")
+    symbol = ET.SubElement(symbols, "symbol", type="fill", name="0", alpha="1")
+    seen_through = {"color": _channels(style.colour, _PALE), "outline_color": _channels(style.colour)}
+    _add_layer(symbol, "SimpleFill", {**seen_through, "outline_width": "0.4"})
+
+
 def _add_disc(symbols: ET.Element, name: str, colour: str) -> None:
     symbol = ET.SubElement(symbols, "symbol", type="marker", name=name, alpha="1")
     _add_layer(symbol, "SimpleMarker", {"name": "circle", "color": _channels(colour), "size": "2"})
@@ -184,6 +218,6 @@ def _add_layer(symbol: ET.Element, kind: str, properties: Mapping[str, str]) -> 
     return layer
 
 
-def _channels(colour: str) -> str:
+def _channels(colour: str, opacity: int = 255) -> str:
     """A colour `#rrggbb` as QGIS writes it: red, green, blue, opacity."""
-    return ",".join(map(str, (*bytes.fromhex(colour[1:]), 255)))
+    return ",".join(map(str, (*bytes.fromhex(colour[1:]), opacity)))

@@ -1,5 +1,6 @@
 """The points of a registration and their residuals, as layers of a GeoPackage."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,18 +10,27 @@ import shapely
 from amers.services.formats.gcp.json_formats import measured_numbers
 from amers.services.formats.vector.qgis_styles import add_styles
 from amers.services.geodesy import metres_per_degree_at, wrapped_degrees
-from amers.services.types import Measures
+from amers.services.types import Array, Measures
 
 CRS_3D = "EPSG:4979"
 """Longitude, latitude, height above the WGS 84 ellipsoid."""
+CRS = "EPSG:4326"
 
 VISIBLE_SHARE = 0.04
 
 Fields = dict[str, npt.NDArray[np.generic]]
 
 
-def write_residual_layers(path: Path, measures: Measures, image: str, exaggeration: float) -> None:
-    """Write the layers `residuals` (3D lines) and `control_points` (3D points), with styles for QGIS.
+def write_residual_layers(
+    path: Path,
+    measures: Measures,
+    image: str,
+    exaggeration: float,
+    held: Sequence[Sequence[Array]] = (),
+) -> None:
+    """Write the layers `held_area`, `residuals` (3D lines) and `control_points` (3D points).
+
+    Each has a style for QGIS.
 
     A line starts at the control point and follows, at its height, the residual on the ground, observed
     minus computed, times the exaggeration, which is an attribute of each line. Only matched points have
@@ -31,6 +41,7 @@ def write_residual_layers(path: Path, measures: Measures, image: str, exaggerati
         measures: of all n points within the scene.
         image: name of the scene.
         exaggeration: ratio of the length of a line to that of its residual.
+        held: polygons of rings (n, 2), lon, lat: the area for which accuracy is stated.
     """
     path.unlink(missing_ok=True)
     fields = _fields(measures, image)
@@ -41,9 +52,12 @@ def write_residual_layers(path: Path, measures: Measures, image: str, exaggerati
     lines = shapely.linestrings(np.stack([start, end], axis=1))
     stretch = {"exaggeration": np.full(len(lines), exaggeration)}
     line_fields = {name: values[has_residual] for name, values in fields.items()}
+    area = shapely.MultiPolygon([(rings[0], rings[1:]) for rings in held])
+    of_image: Fields = {"image": np.array([image], dtype=object)}
+    _write(path, "held_area", "MultiPolygon", np.array([area]), of_image)
     _write(path, "residuals", "LineString Z", lines, {**line_fields, **stretch})
     _write(path, "control_points", "Point Z", shapely.points(measures.lon_lat_h), fields)
-    add_styles(path, ["residuals", "control_points"])
+    add_styles(path, ["held_area", "residuals", "control_points"])
 
 
 def exaggeration_for(measures: Measures) -> float:
@@ -88,12 +102,12 @@ def _write(path: Path, layer: str, kind: str, geometry: npt.NDArray[np.object_],
 
     pyogrio.raw.write(
         path,
-        shapely.to_wkb(geometry, output_dimension=3),
+        shapely.to_wkb(geometry, output_dimension=3 if kind.endswith("Z") else 2),
         list(fields.values()),
         list(fields),
         layer=layer,
         driver="GPKG",
         geometry_type=kind,
-        crs=CRS_3D,
+        crs=CRS_3D if kind.endswith("Z") else CRS,
         append=path.exists(),
     )

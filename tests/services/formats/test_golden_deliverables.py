@@ -233,6 +233,7 @@ def test_gdal_reads_both_layers_of_residuals_with_their_reference_system(tmp_pat
     write_residual_layers(path, measures(), "invented", RESIDUALS["exaggeration"])
     kinds = {name: pyogrio.read_info(path, layer=name) for name, _ in pyogrio.list_layers(path)}
     assert {name: info["geometry_type"] for name, info in kinds.items()} == {
+        "held_area": "MultiPolygon",
         "residuals": "LineString Z",
         "control_points": "Point Z",
         "layer_styles": None,
@@ -254,6 +255,10 @@ def test_qgis_finds_arrows_of_residuals_in_the_colours_of_the_report(tmp_path: P
         assert (columns[layer], 1) == (column, is_default)
         renderer = ElementTree.fromstring(qml).find("renderer-v2")
         assert renderer is not None
+        if layer == "held_area":
+            drawn_area = [one.get("class") for one in renderer.iterfind("symbols/symbol/layer")]
+            assert (renderer.get("type"), drawn_area) == ("singleSymbol", ["SimpleFill"])
+            continue
         assert (renderer.get("type"), renderer.get("attr")) == ("categorizedSymbol", "status")
         colours = [one.get("v") for one in renderer.iterfind(".//prop[@k='color']")]
         words = [one.get("value") for one in renderer.iterfind("categories/category")]

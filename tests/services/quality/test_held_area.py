@@ -131,7 +131,7 @@ def test_places_beyond_the_area_move_to_its_nearest() -> None:
 def test_an_image_without_points_is_not_held() -> None:
     area = held(NOBODY)
     assert area.percent == 0.0
-    assert area.rings == ()
+    assert area.polygons == ()
     np.testing.assert_array_equal(area.nearest(np.array([[3.0, 4.0]])), [[3.0, 4.0]])
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 
 from amers.services.errors import NotEnoughPoints
 from amers.services.quality.cell_stability import measure_cell_stability
@@ -194,15 +195,32 @@ def test_the_prediction_grows_towards_the_edge_along_a_drift(registered):
     assert np.isnan(result.on_the_earth_worst_m)
 
 
-def test_points_are_counted_in_cells_beside_the_share_of_the_image_that_they_hold():
+def test_points_are_counted_in_cells_beside_the_share_of_the_image_that_they_hold(registered):
     line_sample = np.array([[-0.5, -0.5], [10.0, 10.0], [99.4, 199.4], [50.0, np.nan]])
     agree, nothing = np.ones(3, dtype=bool), np.zeros(3, dtype=bool)
     held = held_area(TriedPoints(line_sample[:3], agree, nothing, nothing), (100, 200), 0.0)
-    coverage = image_coverage(line_sample, held, 5)
+    scene = registered().adjusted()
+    active = replace(scene.measures.take(np.arange(4)), line_sample=line_sample)
+    coverage = image_coverage(scene.model, active, held, 5)
     assert (coverage.cells[0, 0], coverage.cells[4, 4]) == (2, 1)
     assert coverage.percent == held.percent
     places = np.random.default_rng(1).uniform(0.0, 100.0, (500, 2)) * [1.0, 2.0]
     np.testing.assert_array_equal(coverage.holds(places), held.holds(places))
+
+
+def test_the_area_on_the_ground_is_where_the_registered_model_has_it(registered):
+    """Places of the ground lie in it where the image holds them; holes included."""
+    scene = registered().adjusted()
+    coverage = qualified(registered()).coverage
+    height_m = float(np.median(scene.measures.lon_lat_h[scene.measures.active, 2]))
+    area = shapely.MultiPolygon([(rings[0], rings[1:]) for rings in coverage.polygons_lon_lat])
+    assert area.is_valid
+    rng = np.random.default_rng(2)
+    places = rng.uniform(-0.1, 1.1, (2000, 2)) * scene.shape
+    lon_lat = scene.model.locate(places, np.full(2000, height_m))[:, :2]
+    inside = shapely.contains_xy(area, lon_lat)
+    assert (inside != coverage.holds(places)).mean() < 0.005
+    assert 0.1 < inside.mean() < 0.9
 
 
 @pytest.mark.parametrize(

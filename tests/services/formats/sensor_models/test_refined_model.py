@@ -235,6 +235,7 @@ def test_residual_vectors_open_in_a_gis_with_heights_and_reference_system(
     for _ in range(2):
         write_residual_layers(path, measures, "scene", exaggeration)
     assert {name for name, _ in pyogrio.list_layers(path)} == {
+        "held_area",
         "residuals",
         "control_points",
         "layer_styles",
