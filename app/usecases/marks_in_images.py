@@ -273,7 +273,9 @@ def _of_registration(accuracy: CorrectionAccuracy, line_sample: Array) -> ModelE
     """Errors of a registered model where its marks are; NaN where its registration states none."""
     if not len(line_sample):
         return EXACT_MODEL
-    shared = replace(accuracy, local_sigma_px=np.zeros(2)).relative_px2(line_sample).mean(axis=0)
+    shared = (
+        replace(accuracy, local_sigma_px=np.zeros(2), held=None).relative_px2(line_sample).mean(axis=0)
+    )
     return ModelErrors(shared, np.nan_to_num(accuracy.local_sigma_px))
 
 

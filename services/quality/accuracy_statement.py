@@ -122,7 +122,8 @@ def vertices_accuracy(
     """The statement for vertices that were located through the model of a scene and a terrain.
 
     Args:
-        relative_m: CE90 (n,) of the vertices relative to the control points; NaN when unknown.
+        relative_m: CE90 (n,) of the vertices relative to the control points; NaN when unknown, such as
+            beyond the area that points hold.
         on_the_earth_m: the same with the frame of the control points.
         frame: of the control points; None for a scene that is not registered.
     """
@@ -173,7 +174,14 @@ def _of_vertices(ce90_m: Array) -> str:
     if np.isnan(worst_m):
         return "CE90 unknown"
     median_m = _metres(float(np.nanmedian(ce90_m)))
-    return f"CE90 {_metres(worst_m)} (worst vertex), {median_m} (median vertex)"
+    words = f"CE90 {_metres(worst_m)} (worst vertex), {median_m} (median vertex)"
+    unknown = int(np.isnan(ce90_m).sum())
+    if not unknown:
+        return words
+    return (
+        f"{words}; unknown for {unknown} of {len(ce90_m)} vertices, beyond the area of the image that "
+        "control points hold, or where a line of sight grazes the ground"
+    )
 
 
 def _with_reason(words: str, frame: Frame) -> str:

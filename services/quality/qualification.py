@@ -3,12 +3,12 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-import shapely
 from scipy.spatial import KDTree
 
 from amers.services.quality.accuracy import Statistics, statistics
 from amers.services.quality.accuracy_statement import AccuracyStatement, scene_accuracy
 from amers.services.quality.cell_stability import CellStability, measure_cell_stability
+from amers.services.quality.correction_accuracy import in_rings
 from amers.services.quality.criteria import Criterion, Verdict, at_least, at_most, verdict_of
 from amers.services.quality.finding import Finding
 from amers.services.quality.findings import with_findings
@@ -152,8 +152,7 @@ class Coverage:
 
     def holds(self, line_sample: Array) -> BoolArray:
         """Which places (n, 2) of the image are held."""
-        inside = [shapely.contains_xy(shapely.Polygon(ring), line_sample) for ring in self.outline]
-        return np.asarray(np.sum(inside, axis=0) % 2 == 1) & np.ones(len(line_sample), dtype=bool)
+        return in_rings(self.outline, line_sample)
 
 
 @dataclass(frozen=True)

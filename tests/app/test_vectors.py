@@ -147,6 +147,39 @@ def test_the_accuracy_of_a_registered_scene_is_stated(inputs: list[object], tmp_
     assert max(row["ce90_earth"] for row in rows) == pytest.approx(earth_m)
 
 
+def test_vertices_beyond_the_area_that_points_hold_have_no_accuracy(
+    inputs: list[object], tmp_path: Path
+) -> None:
+    """Points hold lines 0 to 200, but for a hole; the second line leaves them, the third point is in it."""
+    folder = registered(tmp_path / "a", in_the_image(), Frame.from_sigmas(3.0, 3.0))
+    document = json.loads((folder / "correction.json").read_text())
+    around = [[-0.5, -0.5], [-0.5, 399.5], [200.0, 399.5], [200.0, -0.5], [-0.5, -0.5]]
+    hole = [[100.0, 100.0], [140.0, 100.0], [140.0, 160.0], [100.0, 160.0], [100.0, 100.0]]
+    document["held_outline_px"] = [around, hole]
+    (folder / "correction.json").write_text(json.dumps(document))
+    lines = drawn(
+        tmp_path / "drawn.gpkg",
+        "LINESTRING (50 -50, 300 -150)",
+        "LINESTRING (50 -50, 300 -250)",
+        "POINT (130 -120)",
+    )
+    vertices = tmp_path / "v.gpkg"
+    output = ["-o", tmp_path / "map.gpkg", "--vertices", vertices]
+    record = run("correct", lines, *inputs, *output, "--registration", folder)
+    rows = read_layer(vertices).attributes.to_pylist()
+    columns = read_layer(tmp_path / "map.gpkg").attributes
+    for column in ("ce90_m", "ce90_earth"):
+        assert [value is None for value in columns[column].to_pylist()] == [False, True, True]
+        assert [row[column] is None for row in rows] == [False, False, False, True, True]
+    assert "unknown for 2 of 5 vertices" in record["relative_to_control_points"]["words"]
+    assert record["relative_to_control_points"]["ce90_m"] is not None
+    for wrong in ([[0.0, 0.0]], [[[0.0, 0.0], [1.0, 1.0]]], "all"):
+        document["held_outline_px"] = wrong
+        (folder / "correction.json").write_text(json.dumps(document))
+        with pytest.raises(AmersError, match=r"correction\.json: held_outline_px"):
+            run("correct", lines, *inputs, *output, "--registration", folder)
+
+
 def test_the_registered_model_places_the_vectors(inputs: list[object], tmp_path: Path) -> None:
     folder = registered(tmp_path / "a", in_the_image(lines_off=7))
     point = drawn(tmp_path / "drawn.gpkg", "POINT (100.5 -50.5)")

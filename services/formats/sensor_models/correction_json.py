@@ -36,6 +36,8 @@ _PROFILE = {
 }
 """Attributes of a profile, and the shape of each for a node."""
 
+_SMALLEST_RING = 4
+"""Positions of a closed ring, the last of which is the first."""
 _DECIMALS, _HELD_DECIMALS = 6, 1
 """Of the values at the nodes of a grid, and of an outline."""
 
@@ -165,7 +167,22 @@ def parse_correction_accuracy(text: str, source: str = "correction") -> Correcti
         _numbers(document, "local_sigma_px", (2,), source),
         Frame(_covariance(document, "frame_covariance_m2", 3, source)),
         float(apart_px),
+        _held(document, source),
     )
+
+
+def _held(document: dict[str, Any], source: str) -> tuple[Array, ...] | None:
+    """The rings of the area for which accuracy is stated; None in documents without it."""
+    rings = document.get("held_outline_px")
+    if rings is None:
+        return None
+    place = f"{source}: held_outline_px"
+    if not isinstance(rings, list) or not all(isinstance(ring, list) for ring in rings):
+        raise FormatError(f"{place}: expected a list of rings of line and sample")
+    out = tuple(_numbers({"ring": ring}, "ring", (len(ring), 2), place) for ring in rings)
+    if any(len(ring) < _SMALLEST_RING for ring in out):
+        raise FormatError(f"{place}: expected rings of {_SMALLEST_RING} positions or more")
+    return out
 
 
 def _grid(document: dict[str, Any], source: str) -> DisplacementGrid:

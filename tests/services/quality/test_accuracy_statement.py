@@ -92,9 +92,13 @@ def test_vertices_are_stated_by_the_worst_and_the_median_of_those_that_are_known
     relative_m, earth_m = np.array([1.0, 2.0, np.nan, 4.0]), np.array([3.0, 5.0, np.nan, 9.0])
     stated = vertices_accuracy(relative_m, earth_m, TILTED)
     assert (stated.relative_to_control_points.ce90_m, stated.on_the_earth.ce90_m) == (4.0, 9.0)
+    unknown = (
+        "unknown for 1 of 4 vertices, beyond the area of the image that control points hold, or where a "
+        "line of sight grazes the ground"
+    )
     assert stated.lines == (
-        "Relative to the control points: CE90 4.00 m (worst vertex), 2.00 m (median vertex)",
-        "On the Earth: CE90 9.00 m (worst vertex), 5.00 m (median vertex)",
+        f"Relative to the control points: CE90 4.00 m (worst vertex), 2.00 m (median vertex); {unknown}",
+        f"On the Earth: CE90 9.00 m (worst vertex), 5.00 m (median vertex); {unknown}",
     )
 
 
