@@ -1,5 +1,6 @@
 """What the library opens: scenes, blocks of control points, terrains."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +17,7 @@ from amers.services.formats.block.document import BlockMetadata
 from amers.services.formats.block.reader import FolderChips, read_block
 from amers.services.formats.images.bands import parse_bands
 from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.pieces import source_of
 from amers.services.imagery import scene as imagery
 from amers.services.sensors.base import SensorModel
 from amers.services.statements import Statements
@@ -223,12 +225,17 @@ def open_block(folder: FilePath) -> Block:
 
 
 def open_terrain(
-    dem: FilePath, *, vertical: str | None = None, geoid: FilePath | None = None, fill_px: int = 0
+    dem: FilePath | Sequence[FilePath],
+    *,
+    vertical: str | None = None,
+    geoid: FilePath | None = None,
+    fill_px: int = 0,
 ) -> Terrain:
     """The terrain in a file with heights.
 
     Args:
-        dem: GeoTIFF (or COG), JPEG 2000 or NITF on a map.
+        dem: GeoTIFF (or COG), JPEG 2000 or NITF on a map: a path or an address, or several tiles; also a
+            folder, an archive, a list or a STAC catalogue of them.
         vertical: vertical datum of the heights where the file does not state it: "ellipsoid", "EGM96",
             "EGM2008" or the code of a vertical reference system. By default the file has to state it.
         geoid: grid file of the geoid. By default the grid that PROJ has installed.
@@ -237,8 +244,9 @@ def open_terrain(
     Raises:
         InputError: the file cannot be used, or its vertical datum is unknown.
     """
+    source = source_of([dem] if isinstance(dem, str | Path) else dem)
     grid_file = None if geoid is None else Path(geoid)
-    file = TerrainFile(Path(dem), vertical, grid_file, fill_px, geoid_option="`geoid`")
+    file = TerrainFile(source, vertical, grid_file, fill_px, geoid_option="`geoid`")
     return Terrain(file, read_terrain(file))
 
 

@@ -61,6 +61,7 @@ from amers.opened import (
 )
 from amers.services.errors import AmersError, InputError
 from amers.services.formats.gcp.reader import StatedByCaller
+from amers.services.formats.pieces import source_of
 from amers.services.formats.sensor_models.rpc_files import ImageFiles
 from amers.services.formats.vector.pixel_coordinates import PixelOrigin
 from amers.services.misfit.affine_fit import Order
@@ -218,7 +219,7 @@ def register(  # noqa: PLR0913 - options by keyword, as those of the command
 
 def register_on_reference(
     scene: Scene | FilePath,
-    reference: FilePath,
+    reference: FilePath | Sequence[FilePath],
     terrain: Terrain | FilePath | None,
     folder: FilePath | None = None,
     *,
@@ -231,7 +232,8 @@ def register_on_reference(
 
     Args:
         scene: the scene or its path.
-        reference: ortho-image on a map.
+        reference: ortho-image on a map: a path or an address, or several pieces of it; also a folder, an
+            archive, a list or a STAC catalogue of them.
         terrain: heights of the same ground, open or the path of a file that states its vertical datum.
             None only for a scene that is an ortho-image, which heights do not move.
         folder, check_points, max_ce90_on_earth_m, copy_image, progress: as for `register`, with the same
@@ -246,12 +248,14 @@ def register_on_reference(
     """
     limits = QualificationOptions(max_ce90_on_earth_m=max_ce90_on_earth_m)
     options = RegistrationOptions(qualification=limits)
-    files = ReferenceFiles(Path(reference), None if terrain is None else _terrain_file(terrain))
+    if folder is None:
+        _refuse_without_folder(check_points, copy_image)
+    image = source_of([reference] if isinstance(reference, str | Path) else reference)
+    files = ReferenceFiles(image, None if terrain is None else _terrain_file(terrain))
     if folder is not None:
         sources = ControlSources(find_reference=given_reference(files))
         outputs = _Outputs(Path(folder), check_points, copy_image)
         return _registered(scene, sources, outputs, options, progress)
-    _refuse_without_folder(check_points, copy_image)
     covering = CoveringReference(files.image.name, files)
     opened = read_reference(files)
     content = as_scene(scene).content
@@ -622,4 +626,4 @@ def _folder_of(block: Block | FilePath) -> Path:
 def _terrain_file(terrain: Terrain | FilePath) -> TerrainFile:
     if isinstance(terrain, Terrain):
         return terrain.file
-    return TerrainFile(Path(terrain), geoid_option="`geoid`")
+    return TerrainFile(source_of([terrain]), geoid_option="`geoid`")

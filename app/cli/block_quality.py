@@ -61,7 +61,7 @@ class HeightOptions(TerrainOptions):
     """Heights that those of a block are compared with.
 
     Attributes:
-        dem: heights to compare with: a file, or a folder or .txt list of tiles.
+        dem: heights to compare with: files, folders, archives, .txt lists or STAC catalogues of tiles.
         vertical: vertical datum of --dem: ellipsoid, EGM96, EGM2008, EPSG:…
         dem_sigma_m: sigma of these heights, metres; by default that of each cell of a surface,
             else 0.1 of their step.

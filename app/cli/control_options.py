@@ -3,13 +3,14 @@
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from amers.app.cli.options import FromMilli, GeoidFile, option_name
+from amers.app.cli.options import FromMilli, GeoidFile, Places, option_name
 from amers.app.cli.point_statements import sigma_pair, stated_by_caller
 from amers.app.errors import InputError
 from amers.app.usecases.control_files import ControlFiles, HeightFile
 from amers.app.usecases.marked_files import PointStatements
 from amers.app.usecases.registration.control_marks import MarkFiles
 from amers.app.usecases.terrain_file import TerrainFile
+from amers.services.formats.pieces import source_of
 
 
 @dataclass(frozen=True)
@@ -29,8 +30,8 @@ class MarkOptions:
         control_crs: reference system of x and y of a CSV, such as EPSG:32633.
         control_columns: columns of a CSV of other names: lon=COLUMN,lat=COLUMN,…
         control_sigma_axes: axes of the sigmas of an ASP file: ecef or lat-lon-height.
-        control_dem: heights of marks whose file has none, as that of QGIS: a file, or a folder or .txt
-            list of tiles.
+        control_dem: heights of marks whose file has none, as that of QGIS: a file, folder, archive, .txt
+            list or STAC catalogue of tiles; path or address; repeat for several.
         control_dem_vertical: vertical datum of --control-dem: ellipsoid, EGM96, EGM2008, EPSG:…
         control_dem_geoid: grid file of the geoid of --control-dem, GTX or GeoTIFF.
         control_dem_sigma_m: sigma of its heights, metres; by default its own, or a tenth of its posting.
@@ -45,7 +46,7 @@ class MarkOptions:
     control_crs: str | None = None
     control_columns: str | None = None
     control_sigma_axes: str | None = None
-    control_dem: Path | None = None
+    control_dem: Places = ()
     control_dem_vertical: str | None = None
     control_dem_geoid: GeoidFile = None
     control_dem_sigma_m: FromMilli = None
@@ -61,9 +62,9 @@ class MarkOptions:
         """
         if self.control:
             terrain = None
-            if self.control_dem is not None:
+            if self.control_dem:
                 terrain = TerrainFile(
-                    self.control_dem,
+                    source_of(self.control_dem),
                     self.control_dem_vertical,
                     self.control_dem_geoid,
                     geoid_option="--control-dem-geoid",
@@ -73,7 +74,7 @@ class MarkOptions:
         alone = [
             option_name(field.name)
             for field in fields(self)
-            if field.name != "control" and getattr(self, field.name) is not None
+            if field.name != "control" and getattr(self, field.name) not in (None, ())
         ]
         if alone:
             raise InputError(f"{', '.join(alone)}: of --control, which is missing; add it")
@@ -100,8 +101,8 @@ class ControlOptions:
         control_ortho: ortho-image that places the block east and north; repeat for several.
         control_ortho_sigma_m: accuracy of --control-ortho on the Earth, one sigma a coordinate, metres;
             by default that of the product.
-        control_dem: heights of the ground that places the block in height: a file, or a folder or .txt
-            list of tiles.
+        control_dem: heights of the ground that places the block in height: a file, folder, archive, .txt
+            list or STAC catalogue of tiles; path or address; repeat for several.
         control_dem_vertical: vertical datum of --control-dem: ellipsoid, EGM96, EGM2008, EPSG:…
         control_dem_geoid: grid file of the geoid of --control-dem, GTX or GeoTIFF.
         control_dem_sigma_m: sigma of single heights of --control-dem, metres; a surface has its own.
@@ -119,7 +120,7 @@ class ControlOptions:
     control_sigma_axes: str | None = None
     control_ortho: tuple[Path, ...] = ()
     control_ortho_sigma_m: FromMilli = None
-    control_dem: Path | None = None
+    control_dem: Places = ()
     control_dem_vertical: str | None = None
     control_dem_geoid: GeoidFile = None
     control_dem_sigma_m: FromMilli = None
@@ -143,10 +144,10 @@ class ControlOptions:
         )
 
     def _heights(self) -> HeightFile | None:
-        if self.control_dem is None:
+        if not self.control_dem:
             return None
         terrain = TerrainFile(
-            self.control_dem,
+            source_of(self.control_dem),
             self.control_dem_vertical,
             self.control_dem_geoid,
             geoid_option="--control-dem-geoid",

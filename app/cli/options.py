@@ -27,6 +27,21 @@ GeoidFile = Annotated[Path | None, typer.Option()]
 """A grid file of a geoid: by its path, or its name alone where PROJ keeps its grids."""
 
 
+def existing_place(text: str) -> str:
+    """The text of an address, or of a path, which must exist.
+
+    Raises:
+        BadParameter: it does not.
+    """
+    if "://" not in text and not Path(text).exists():
+        raise typer.BadParameter(f"path '{text}' does not exist")
+    return text
+
+
+Places = Annotated[tuple[str, ...], typer.Option(parser=existing_place, metavar="PATH")]
+"""Paths and addresses of files, folders and catalogues: an option that is given repeatedly."""
+
+
 class Shown(dict[str, OptionInfo | ArgumentInfo | None]):
     """The fields of a dataclass that a command has options for, in the order of its help.
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from amers.app.cli.options import GeoidFile, Shown
+from amers.app.cli.options import GeoidFile, Places, Shown
 from amers.app.cli.output import AsJson, show_one
 from amers.app.cli.point_statements import sigma_pair, stated_by_caller
 from amers.app.cli.production_rows import accuracy_row, agreement_row, sampling_pair
@@ -15,6 +15,7 @@ from amers.app.usecases.model_choice import ModelChoice
 from amers.app.usecases.new_block import BlockIdentity
 from amers.app.usecases.points_production import KnownPointFiles, run_points_production
 from amers.app.usecases.terrain_file import TerrainFile
+from amers.services.formats.pieces import source_of
 from amers.services.production.points_production import KnownPointOptions
 
 Files = Annotated[
@@ -55,16 +56,18 @@ class StatementOptions:
     columns: str | None = None
     sigma_axes: str | None = None
     point_sigma_m: str | None = None
-    dem: Path | None = None
+    dem: Places = ()
     dem_vertical: str | None = None
     dem_geoid: GeoidFile = None
 
     @property
     def terrain(self) -> TerrainFile | None:
         """The heights of points without any; None without --dem."""
-        if self.dem is None:
+        if not self.dem:
             return None
-        return TerrainFile(self.dem, self.dem_vertical, self.dem_geoid, geoid_option="--dem-geoid")
+        return TerrainFile(
+            source_of(self.dem), self.dem_vertical, self.dem_geoid, geoid_option="--dem-geoid"
+        )
 
 
 def points(

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from amers.app.cli.control_options import MarkOptions
-from amers.app.cli.options import FromMilli, GeoidFile, words_of
+from amers.app.cli.options import FromMilli, GeoidFile, Places, words_of
 from amers.app.cli.output import AsJson
 from amers.app.cli.scene_registration import (
     Control,
@@ -32,6 +32,7 @@ from amers.app.usecases.registration.reference_source import ReferenceFiles, che
 from amers.app.usecases.registration.register import SceneFiles
 from amers.app.usecases.terrain_file import TerrainFile
 from amers.services.formats.images.scenes import scene_name
+from amers.services.formats.pieces import source_of
 
 
 @dataclass(frozen=True)
@@ -40,8 +41,10 @@ class ControlOptions:
 
     Attributes:
         block: use the points of this block folder instead of the store.
-        reference: ortho-image to register on; with --block only where it has no points.
-        dem: heights of the reference's ground: a file, or a folder or .txt list of tiles.
+        reference: ortho-image to register on, or its pieces: file, folder, .SAFE, .zip, .vrt, .txt list
+            or STAC catalogue; path or address; repeat for several; with --block only where it has no
+            points.
+        dem: heights of the reference's ground, or their tiles: the same.
         vertical: vertical datum of these heights: ellipsoid, EGM96, EPSG:…
         geoid: grid file of the geoid, GTX or GeoTIFF; also its name among PROJ's grids.
         reference_sigma_m: accuracy of the reference on the Earth, one sigma, metres.
@@ -49,8 +52,8 @@ class ControlOptions:
     """
 
     block: Path | None = None
-    reference: Path | None = None
-    dem: Path | None = None
+    reference: Places = ()
+    dem: Places = ()
     vertical: str | None = None
     geoid: GeoidFile = None
     reference_sigma_m: FromMilli = None
@@ -63,17 +66,18 @@ class ControlOptions:
             InputError: something is stated of a reference that is not given, or it is not on a map.
         """
         sigmas_m = (self.reference_sigma_m, self.reference_sigma_up_m)
-        if self.reference is None:
-            if self.dem is not None:
+        if not self.reference:
+            if self.dem:
                 raise InputError("--dem: it has the heights of a reference; add --reference")
             if sigmas_m != (None, None):
                 raise InputError(
                     "--reference-sigma-m, --reference-sigma-up-m: of a reference; add --reference"
                 )
             return Control(self.block, None, marks)
-        check_map(self.reference)
-        terrain = None if self.dem is None else TerrainFile(self.dem, self.vertical, self.geoid)
-        return Control(self.block, ReferenceFiles(self.reference, terrain, *sigmas_m), marks)
+        image = source_of(self.reference)
+        check_map(image)
+        terrain = TerrainFile(source_of(self.dem), self.vertical, self.geoid) if self.dem else None
+        return Control(self.block, ReferenceFiles(image, terrain, *sigmas_m), marks)
 
 
 @dataclass(frozen=True)
@@ -151,7 +155,7 @@ class WorkOptions:
         """
         if self.server is None:
             return None
-        if control.reference is not None or control.block is not None:
+        if control.reference or control.block is not None:
             raise InputError(
                 "--server: the service uses its own points and references; leave out --block and "
                 "--reference"

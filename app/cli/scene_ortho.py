@@ -9,7 +9,7 @@ import typer
 from amers.app.cli.options import Shown
 from amers.app.cli.output import AsJson, show_one
 from amers.app.cli.progress import shown_progress
-from amers.app.cli.terrain_options import Terrain
+from amers.app.cli.terrain_options import NeededTerrain
 from amers.app.errors import InputError
 from amers.app.usecases.model_choice import ModelChoice
 from amers.app.usecases.orthorectification import OrthoMap, run_orthorectification
@@ -27,7 +27,7 @@ def ortho(
         ),
     ],
     *,
-    terrain: Terrain,
+    ground: NeededTerrain,
     registered: Annotated[
         Path | None,
         typer.Option(
@@ -50,7 +50,7 @@ def ortho(
     with shown_progress() as progress:
         orthorectified = run_orthorectification(
             ImageFiles(scene, model, crop_origin),
-            terrain,
+            ground.terrain,
             output,
             ortho_map=ortho_map,
             options=replace(options, kernel="cubic" if kernel == "cubic" else "bilinear"),

@@ -8,7 +8,7 @@ import typer
 
 from amers.app.cli.options import Shown
 from amers.app.cli.output import AsJson, print_json, show_one
-from amers.app.cli.terrain_options import Terrain
+from amers.app.cli.terrain_options import NeededTerrain
 from amers.app.errors import InputError
 from amers.app.usecases.registered_scene import SceneModel
 from amers.app.usecases.vector_files import CorrectionOptions, ProjectionOptions, VectorFile
@@ -42,7 +42,7 @@ def correct(
     vectors: Vectors,
     *,
     scene: Annotated[SceneModel, Shown(**_SCENE, sigma_m=typer.Option(min=0.01))],
-    terrain: Terrain,
+    ground: NeededTerrain,
     output: Output,
     to: Annotated[
         str | None, typer.Option(help="Reference system of the map; by default the UTM zone.")
@@ -65,7 +65,7 @@ def correct(
     corrected = correct_file(
         VectorFile(vectors, layer),
         scene,
-        terrain,
+        ground.terrain,
         output,
         crs=to,
         vertices=vertices,
@@ -83,7 +83,7 @@ def project(
     vectors: Vectors,
     *,
     scene: Annotated[SceneModel, Shown(**_SCENE)],
-    terrain: Terrain,
+    ground: NeededTerrain,
     output: Output,
     layer: Layer = None,
     pixels: Pixels = "qgis",
@@ -95,7 +95,7 @@ def project(
     projected = project_file(
         VectorFile(vectors, layer),
         scene,
-        terrain,
+        ground.terrain,
         output,
         vertices=vertices,
         options=replace(options, pixels=_origin(pixels)),

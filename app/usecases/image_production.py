@@ -28,7 +28,8 @@ from amers.services.formats.block.document import AccuracyFigure, BlockMetadata,
 from amers.services.formats.block.writer import write_block
 from amers.services.formats.images.scenes import read_scene
 from amers.services.formats.stac.catalogue import read_catalogue
-from amers.services.formats.stac.scenes import image_place, read_item_scene
+from amers.services.formats.stac.places import image_place
+from amers.services.formats.stac.scenes import read_item_scene
 from amers.services.formats.work_folder import WorkFolder
 from amers.services.imagery.scene import Scene
 from amers.services.production.image_production import Production, ProductionOptions, produce_points

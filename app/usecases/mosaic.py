@@ -27,6 +27,7 @@ from amers.app.usecases.mosaic_scenes import (
 from amers.app.usecases.terrain_file import TerrainFile, read_terrain
 from amers.services.errors import CoverageError
 from amers.services.formats.images.ortho import BandForm, write_cog
+from amers.services.formats.pieces import paths_of
 from amers.services.formats.vector.seam_layer import write_seam_layer
 from amers.services.formats.work_folder import WorkFolder
 from amers.services.imagery.scene import scene_footprint
@@ -295,7 +296,10 @@ def _inputs(
             {**_fact(one.path), "models": _digest((one.scene.scene.model, one.scene.delivered))}
             for one in read
         ],
-        "ground": {**asdict(ground), **({} if dem is None else _fact(dem))},
+        "ground": {
+            **asdict(ground),
+            **({} if dem is None else {"dem": [_fact(path) for path in paths_of(dem)]}),
+        },
         "options": asdict(options),
         "map": [wanted.crs, wanted.gsd_m, outline],
     }

@@ -43,6 +43,7 @@ from amers.services.formats.images.bands import one_band
 from amers.services.formats.images.ortho import BandForm, write_cog
 from amers.services.formats.images.raster import RasterImage
 from amers.services.formats.images.tiled_image import SceneImage, TiledImage
+from amers.services.formats.pieces import paths_of
 from amers.services.formats.sensor_models.rpc_files import ImageFiles
 from amers.services.imagery.scene import Scene, scene_gsd_m
 from amers.services.map_grid import MapGrid, check_map_code
@@ -229,7 +230,7 @@ def run_orthorectification(
         InputError: the scene or the terrain cannot be used, or no pixel of the map shows the scene.
         ComputationError: the mapping exceeds the tolerance.
     """
-    _check_request(ortho_map, output, (source.image, terrain.dem))
+    _check_request(ortho_map, output, (source.image, *paths_of(terrain.dem)))
     # Each band is rectified by itself: none has to lie on another one.
     scene, _ = registered_scene(source, registration, one_band(1))
     raster = scene.image

@@ -20,6 +20,7 @@ from amers.app.usecases.registration.reference_source import (
 )
 from amers.app.usecases.server_files import file_below
 from amers.app.usecases.terrain_file import TerrainFile
+from amers.services.formats.pieces import CATALOGUES
 from amers.services.geodesy import ecef_from_lon_lat_h
 from amers.services.imagery.scene import Scene, scene_footprint
 from amers.services.matching.reference_image import ReferenceMatchingOptions
@@ -182,6 +183,12 @@ def reference_files(settings: Settings, reference: NewReference | ReferenceRow) 
     elif reference.vertical is not None or reference.geoid is not None:
         raise InputError("vertical, geoid: of the heights of a dem, but dem is missing; add it")
     image = _path_below(settings, "image", reference.image)
+    for path in (reference.image, reference.dem or ""):
+        if path.lower().endswith(CATALOGUES):
+            raise InputError(
+                f"{path}: a catalogue leads to files elsewhere; an image below AMERS_REFERENCE_FOLDER "
+                "expected"
+            )
     return ReferenceFiles(image, terrain, reference.sigma_m, reference.sigma_up_m)
 
 

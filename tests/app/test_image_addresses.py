@@ -200,6 +200,7 @@ def test_only_the_operator_s_production_makes_addresses() -> None:
     """Nothing that callers send becomes one.
 
     The map of a surface reads a result out of the bucket of the storage, by a key of its own making.
+    References and terrains in pieces are those of commands; references of a store are no catalogues.
     """
     root = Path(__file__).parents[2]
     makers = {
@@ -213,7 +214,9 @@ def test_only_the_operator_s_production_makes_addresses() -> None:
         "app/usecases/image_production.py",
         "app/usecases/surface_map.py",
         "services/formats/addresses.py",
+        "services/formats/pieces.py",
         "services/formats/stac/documents.py",
+        "services/formats/stac/places.py",
         "services/formats/stac/scenes.py",
     }
     importers = [

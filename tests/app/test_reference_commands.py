@@ -32,6 +32,7 @@ def folder(tmp_path: Path) -> Path:
     flat = np.full((SIZE, SIZE), 300.0, np.float32)
     for path in ("allowed/land.tif", "allowed/heights.tif", "beside/land.tif"):
         write(tmp_path / path, flat)
+    (tmp_path / "allowed" / "land.json").write_text("{}")
     return tmp_path / "allowed"
 
 
@@ -95,6 +96,7 @@ def test_a_reference_is_added_listed_and_removed(amers: Amers, folder: Path):
         (("none.tif", "--name", "x"), "not a file below the folder"),
         (("land.tif", "--name", " "), "1 to 120 characters"),
         (("land.tif", "--name", "x", "--dem", "heights.tif"), "heights.tif"),
+        (("land.json", "--name", "x"), "a catalogue leads to files elsewhere"),
         (("land.tif", "--name", "x", "--vertical", "ellipsoid"), "of the heights of a dem"),
         (("land.tif", "--name", "x", "--dem", "../beside/land.tif"), "not a file below the folder"),
     ],

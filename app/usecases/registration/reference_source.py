@@ -8,14 +8,13 @@ from pathlib import Path
 from amers.app.errors import InputError
 from amers.app.usecases.registration.control_sources import ControlSet
 from amers.app.usecases.terrain_file import TerrainFile, read_terrain
+from amers.services.formats.addresses import FilePlace
 from amers.services.formats.images.map_statements import map_statements, unused_heights
-from amers.services.formats.images.raster import (
-    RasterImage,
-    map_grid_of,
-    open_raster,
-    shift_of_grid,
-)
+from amers.services.formats.images.mosaic import open_mosaic, open_piece
+from amers.services.formats.images.raster import RasterImage, map_grid_of, shift_of_grid
+from amers.services.formats.pieces import IMAGE_SUFFIXES, IMAGES, PlaceList, Source, pieces_of
 from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ImageSource
 from amers.services.map_grid import MapGrid
 from amers.services.matching.reference_image import Reference
 from amers.services.registration.context import SearchStage
@@ -26,6 +25,7 @@ from amers.services.registration.reference_points import ReferenceChips, referen
 from amers.services.registration.scene_marks import SceneMarks, with_marks
 from amers.services.reports.report import BlockUsed
 from amers.services.sensors.ortho import OrthoModel
+from amers.services.statements import Statements
 from amers.services.types import Array, Frame, Progress
 
 LOCAL_SIGMA_PX = 0.3
@@ -39,14 +39,15 @@ class ReferenceFiles:
     """The files of a reference.
 
     Attributes:
-        image: ortho-image: GeoTIFF (or COG) or JPEG 2000 on a map.
+        image: ortho-image: GeoTIFF (or COG) or JPEG 2000 on a map, or its pieces in files, a folder, an
+            archive, a list or a catalogue; see `amers.services.formats.pieces`.
         terrain: heights of the same ground; only scenes that are ortho-images can be registered without.
         sigma_m: accuracy of the image's frame on the Earth, one standard deviation per coordinate; None
             when unknown.
         sigma_up_m: the same of the heights of its terrain.
     """
 
-    image: Path
+    image: Source
     terrain: TerrainFile | None = None
     sigma_m: float | None = None
     sigma_up_m: float | None = None
@@ -123,48 +124,73 @@ def register_on(
     return registration, ControlSet(points, chips, (used,))
 
 
-def check_map(image: Path) -> None:
+def check_map(image: Source) -> None:
     """Refuse a reference image that lies on no map, before any scene is registered on it.
+
+    What lies in a folder, an archive or a catalogue is read with the first scene.
 
     Raises:
         InputError: the image cannot be read, or has no coordinate reference system.
     """
-    _on_map(image)[0].close()
+    for place in image.places if isinstance(image, PlaceList) else (image,):
+        if isinstance(place, Path) and place.suffix.lower() in IMAGE_SUFFIXES:
+            _on_map(place)[0].close()
 
 
-def read_reference(files: ReferenceFiles) -> Reference:
+def read_reference(files: ReferenceFiles, outline: Array | None = None) -> Reference:
     """Open a reference; its files stay open and are read by windows.
+
+    Args:
+        files: of the reference.
+        outline: (n, 2) lon, lat where it is needed; pieces that lie apart are left out. None takes all.
 
     Raises:
         InputError: the image has no coordinate reference system, or the terrain cannot be used.
     """
-    image, grid = _on_map(files.image)
-    shift = shift_of_grid(image, grid)
-    model = OrthoModel(grid)
-    gsd_m = grid.gsd_m
-    terrain = None if files.terrain is None else read_terrain(files.terrain)
+    image = _opened(files.image, outline)
+    gsd_m = image.grid.gsd_m
+    terrain = None if files.terrain is None else read_terrain(files.terrain, outline=outline)
     return Reference(
-        image=image,
-        model=model,
+        image=image.pixels,
+        model=OrthoModel(image.grid),
         terrain=terrain,
         sigma_m=LOCAL_SIGMA_PX * gsd_m,
         common_sigma_m=COMMON_SIGMA_PX * gsd_m,
         frame=Frame.from_sigmas(
-            math.nan if files.sigma_m is None else math.hypot(files.sigma_m, shift.sigma_m),
+            math.nan if files.sigma_m is None else math.hypot(files.sigma_m, image.shift_sigma_m),
             math.nan if files.sigma_up_m is None else files.sigma_up_m,
         ),
         statements=(
             *image.statements,
-            *map_statements(image, grid, shift),
-            *unused_heights(image, grid),
             *(() if terrain is None else terrain.statements),
         ),
     )
 
 
-def _on_map(path: Path) -> tuple[RasterImage, MapGrid]:
+@dataclass(frozen=True)
+class _Opened:
+    """An opened ortho-image, or several as one."""
+
+    pixels: ImageSource
+    grid: MapGrid
+    statements: Statements
+    shift_sigma_m: float
+
+
+def _opened(source: Source, outline: Array | None) -> _Opened:
+    pieces = pieces_of(source, IMAGES, outline)
+    if len(pieces) > 1:
+        mosaic = open_mosaic(pieces, outline)
+        return _Opened(mosaic, mosaic.grid, mosaic.statements, mosaic.shift_sigma_m)
+    image, grid = _on_map(pieces[0])
+    shift = shift_of_grid(image, grid)
+    said = (*image.statements, *map_statements(image, grid, shift), *unused_heights(image, grid))
+    return _Opened(image, grid, said, shift.sigma_m)
+
+
+def _on_map(path: FilePlace) -> tuple[RasterImage, MapGrid]:
     """An opened image and its map."""
-    image = open_raster(path)
+    image = open_piece(path)
     grid = map_grid_of(image)
     if grid is None:
         image.close()

@@ -348,7 +348,7 @@ def _register(
         attempt.control = ControlSet(marks.points, NoChips(), ())
         return register_on_marks(scene, marks, attempt.options), None
     attempt.reference = reference.name
-    opened = read_reference(reference.files)
+    opened = read_reference(reference.files, outline)
     attempt.statements.extend(opened.statements)
     registration, attempt.control = register_on(
         reference,

@@ -21,12 +21,14 @@ from typing import Any
 import rasterio
 
 from amers.services.errors import FormatError, VerticalDatumError
+from amers.services.formats.addresses import Address, FilePlace
 from amers.services.formats.images.bands import one_band
 from amers.services.formats.images.datasets import GDAL_CACHE, as_format_error
 from amers.services.formats.images.raster import RasterImage, check_declaration, open_values
 from amers.services.formats.images.signatures import DRIVER_OF_SIGNATURE
 from amers.services.formats.images.validity import validity_of
 from amers.services.formats.images.working_copy import Pixels
+from amers.services.formats.pieces import IMAGE_SUFFIXES, PieceKind
 from amers.services.formats.text_files import parse_number, parse_xml, read_text
 from amers.services.imagery.source import Window
 
@@ -80,27 +82,24 @@ class HeightsImage(RasterImage):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """In another process the file is opened again."""
-        assert isinstance(self.path, Path)
-        return open_heights, (self.path.resolve(), self.images_only)
+        path = self.path if isinstance(self.path, Address) else self.path.resolve()
+        return open_heights, (path, self.images_only)
 
 
-IMAGE_SUFFIXES = (".tif", ".tiff", ".jp2", ".ntf", ".nitf")
+HEIGHTS = PieceKind(
+    "files of heights",
+    (*IMAGE_SUFFIXES, *DRIVER_OF_SUFFIX, ".hgt.zip"),
+    ("data", "elevation", "dem"),
+    is_deep=False,
+)
+"""Which files of a folder are heights, by their names; a VRT lists others of the folder."""
 
 
-def is_tile(file: Path) -> bool:
-    """Whether a file of a folder is one of heights, by its name; a VRT lists others of the folder."""
-    name = file.name.lower()
-    suffixes = (*IMAGE_SUFFIXES, *DRIVER_OF_SUFFIX, ".hgt.zip")
-    return (
-        file.is_file() and not name.startswith(".") and name.endswith(suffixes) and file.suffix != ".vrt"
-    )
-
-
-def open_heights(path: Path, images_only: bool = False, deep: int = 0) -> HeightsImage:
+def open_heights(path: FilePlace, images_only: bool = False, deep: int = 0) -> HeightsImage:
     """Open the first band of a file of heights.
 
     Args:
-        path: of the file.
+        path: of the file; at an address only an image is read.
         images_only: only a GeoTIFF, JPEG 2000 or NITF, which names no other file.
         deep: number of VRTs through which it was reached.
 
@@ -108,8 +107,10 @@ def open_heights(path: Path, images_only: bool = False, deep: int = 0) -> Height
         FormatError: the file cannot be used.
         VerticalDatumError: the sources of a VRT contradict each other.
     """
-    driver = None if images_only or not path.is_file() else _driver(path)
-    if driver is None:
+    driver = None
+    if isinstance(path, Path) and path.is_file() and not images_only:
+        driver = _driver(path)
+    if driver is None or isinstance(path, Address):
         image = open_values(path)
     else:
         of_sources = _vrt_sources(path, deep) if driver == "VRT" else None

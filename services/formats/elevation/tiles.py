@@ -1,13 +1,13 @@
 """One file of heights: its map grid, its heights in metres, and what it states."""
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from pyproj import CRS
 
 from amers.services.datums import DatumShift
 from amers.services.errors import AmersError, FormatError
+from amers.services.formats.addresses import FilePlace
 from amers.services.formats.elevation.grid_files import HEIGHTS_OF_FORMAT, HeightsImage, open_heights
 from amers.services.formats.elevation.heights import HeightDatum, HeightsByCaller, height_datum
 from amers.services.formats.images.bands import one_band
@@ -94,7 +94,7 @@ class Sigmas:
 
 
 def read_tile(
-    path: Path,
+    path: FilePlace,
     caller: HeightsByCaller,
     *,
     images_only: bool = False,

@@ -245,7 +245,7 @@ def open_raster(path: FilePlace, bands: int | BandMix | None = 1) -> RasterImage
     return replace(image, statements=statements)
 
 
-def open_values(path: Path) -> RasterImage:
+def open_values(path: FilePlace) -> RasterImage:
     """Open the first band of an image for its values, such as classes, not for its colours.
 
     Raises:

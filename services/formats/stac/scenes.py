@@ -2,9 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlsplit
 
 import shapely
 from pyproj import CRS
@@ -12,18 +10,14 @@ from pyproj.exceptions import CRSError
 
 from amers.services.datums import horizontal
 from amers.services.errors import FormatError
-from amers.services.formats.addresses import Address, FilePlace, file_place
 from amers.services.formats.images.scenes import read_scene
 from amers.services.formats.reader_rows import Reader, Treatment
 from amers.services.formats.stac.items import Json, StacImage, parse_item
+from amers.services.formats.stac.places import image_place
 from amers.services.imagery.hidden import without_hidden_ground
 from amers.services.imagery.scene import Scene
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.statements import Statement, Subject, Use
-
-_IMAGE_TYPES = ("image/tiff", "image/jp2", "application/vnd.nitf")
-_IMAGE_NAMES = (".tif", ".tiff", ".jp2", ".ntf", ".nitf")
-
 
 READER = Reader(
     "Items of STAC catalogues",
@@ -118,48 +112,3 @@ def _is_same(code: str, crs: str) -> bool:
         return horizontal(CRS.from_user_input(code)) == horizontal(CRS.from_user_input(crs))
     except CRSError:
         return False
-
-
-def image_place(item: Json, source: str) -> FilePlace:
-    """The image file of an item: the asset with the role data, or the only image.
-
-    Raises:
-        FormatError: there is none, there are several, or its address cannot be read.
-    """
-    assets = item.get("assets")
-    images = {
-        name: asset
-        for name, asset in (assets.items() if isinstance(assets, dict) else ())
-        if isinstance(asset, dict) and _is_image(asset)
-    }
-    data = {name: asset for name, asset in images.items() if "data" in (asset.get("roles") or ())}
-    chosen = data or images
-    if len(chosen) != 1:
-        found = ", ".join(sorted(chosen)) or "none"
-        raise FormatError(
-            f"{source}: assets: {found} found as images, one GeoTIFF, JPEG 2000 or NITF expected; give "
-            'it the role "data"'
-        )
-    address = str(next(iter(chosen.values()))["href"])
-    try:
-        place = file_place(address)
-    except FormatError as error:
-        raise FormatError(f"{source}: {error}") from None
-    if isinstance(place, Address) or "://" not in address:
-        return place
-    parts = urlsplit(address)
-    if parts.scheme != "file" or parts.netloc:
-        shown = address.partition("?")[0]
-        raise FormatError(
-            f"{source}: {shown:.200}: a file on this machine, in a shared folder, in a bucket (s3://) "
-            "or on a server (https://) expected"
-        )
-    return Path(unquote(parts.path))
-
-
-def _is_image(asset: Json) -> bool:
-    address = asset.get("href")
-    if not isinstance(address, str):
-        return False
-    kind = str(asset.get("type") or "").split(";")[0].strip()
-    return kind in _IMAGE_TYPES or (not kind and address.lower().endswith(_IMAGE_NAMES))
