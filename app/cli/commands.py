@@ -52,6 +52,15 @@ COMMANDS: Tree = {
             ),
         },
     ),
+    "base": Group(
+        "Bases of control points for any region, from open archives of images.",
+        {
+            "make": Command(
+                "base:make",
+                "Make a base of control points for a region from an open archive of images, in one go.",
+            ),
+        },
+    ),
     "points": Group(
         "Points: those of published blocks, and ground coordinates of marks in images.",
         {

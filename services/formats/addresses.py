@@ -39,6 +39,20 @@ _REFUSED = (PermissionDeniedError, UnauthenticatedError)
 _ABSENT = (FileNotFoundError, NotFoundError)
 
 
+@dataclass
+class Traffic:
+    """What this process has read at addresses.
+
+    Attributes:
+        bytes: of ranges of files.
+    """
+
+    bytes: int = 0
+
+
+TRAFFIC = Traffic()
+
+
 @dataclass(frozen=True)
 class Address:
     """A file at `s3://BUCKET/KEY` or `https://…`, with what readers need of a path.
@@ -145,6 +159,7 @@ class Address:
         store, key = self._store()
         with self._errors():
             content = bytes(obstore.get_range(store, key, start=start, length=length))
+        TRAFFIC.bytes += len(content)
         if len(content) != length:
             raise FormatError(
                 f"{self}: {len(content)} bytes from byte {start} on found, {length} expected: the file "
@@ -181,7 +196,7 @@ class Address:
                 if self._is_key
                 else "a signed address may be too old: take it from the catalogue again"
             )
-            raise _AbsentError(f"{self}: access refused, a readable file expected; {how}") from None
+            raise AccessRefused(f"{self}: access refused, a readable file expected; {how}") from None
         except NotSupportedError:
             raise FormatError(
                 f"{self}: the server sends no parts of files (range requests), which are expected; copy "
@@ -189,7 +204,7 @@ class Address:
             ) from None
         except (BaseError, ValueError) as error:
             host = urlsplit(self.url).hostname
-            raise FormatError(
+            raise NoUsableReply(
                 f"{self}: no usable reply ({type(error).__name__}), a file expected; check the network"
                 + (", AWS_REGION and AWS_ENDPOINT_URL" if self._is_key else f" and the server {host}")
                 + ", here and where workers run"
@@ -200,8 +215,16 @@ FilePlace = Path | Address
 """Where a file is."""
 
 
+class NoUsableReply(FormatError):
+    """A server does not answer, or not as expected, however often it is asked."""
+
+
 class _AbsentError(FormatError):
     """Nothing can be read at an address, whose server answers."""
+
+
+class AccessRefused(_AbsentError):
+    """A server refuses a file, such as at a signed address whose time is over."""
 
 
 def without_query(address: str) -> str:

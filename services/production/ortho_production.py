@@ -51,6 +51,7 @@ class OrthoPointOptions:
         local_sigma_px: position of a detail relative to the rest of the image, pixels of the image, one
             standard deviation a coordinate; several images raise it when they disagree by more.
         min_views: least number of images in which a point is found, of those showing it.
+        min_share: least share of the images showing a point in which it is found, 0 to 1.
     """
 
     fine_gsd_m: float | None = None
@@ -61,6 +62,7 @@ class OrthoPointOptions:
     min_saliency: float = 0.05
     local_sigma_px: float = 0.3
     min_views: int = 2
+    min_share: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -184,6 +186,38 @@ def produce_ortho_points(
     return OrthoPoints(points, chips, gsds_m, outline, agreed.shift_m, agreed.local_sigma_m)
 
 
+def shifts_of_scenes(
+    scenes: Sequence[Scene],
+    heights: GroundHeights,
+    options: OrthoPointOptions = OrthoPointOptions(),
+    progress: Progress = no_progress,
+) -> Array:
+    """Shifts (n, 2) east, north, metres, by which ortho-images lie off the first; NaN where not found.
+
+    Each is searched alone at the salient corners of the first, so that one that shows other ground,
+    clouds or another season does not stop the others. The arguments are those of `produce_ortho_points`.
+
+    Raises:
+        InputError: a scene has a parallax, or two have one name.
+    """
+    _check_scenes(scenes)
+    gsds_m = _gsds_m(scenes, options)
+    squares = _squares(scenes[0], scene_gsd_m(scenes[0]), options)
+    corners = _corners(scenes[:1], heights, squares, gsds_m[0], options, progress=no_progress)
+    lon_lat_h = np.array([corner.lon_lat_h for corner in corners]).reshape(-1, 3)
+    shift_m = np.full((len(scenes), 2), np.nan)
+    shift_m[0] = 0.0
+    for k in range(1, len(scenes)):
+        progress(k / len(scenes), f"comparing {len(scenes)} images")
+        try:
+            agreed = agreed_views([scenes[0], scenes[k]], lon_lat_h, gsds_m[0])
+        except NotEnoughPoints:
+            continue
+        if agreed.tied[1]:
+            shift_m[k] = agreed.shift_m[1]
+    return shift_m
+
+
 @dataclass(frozen=True)
 class _Corner:
     """A salient corner: the number of its square, its ground position (3,) and its saliency."""
@@ -229,7 +263,7 @@ def _best_of_squares(
     corners: list[_Corner], agreed: AgreedViews, options: OrthoPointOptions
 ) -> IntArray:
     """The first corner of every square that enough images confirm."""
-    confirmed = np.flatnonzero(agreed.confirmed(options.min_views))
+    confirmed = np.flatnonzero(agreed.confirmed(options.min_views, options.min_share))
     squares = [corners[row].square for row in confirmed]
     return np.asarray(confirmed[np.unique(squares, return_index=True)[1]])
 

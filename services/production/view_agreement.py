@@ -62,10 +62,16 @@ class AgreedViews:
     tied: BoolArray
     local_sigma_m: float
 
-    def confirmed(self, min_views: int) -> BoolArray:
-        """Which points (n,) were found in `min_views` images, or in all that show them."""
+    def confirmed(self, min_views: int, min_share: float = 0.0) -> BoolArray:
+        """Which points (n,) were found in `min_views` images, or in all that show them.
+
+        Args:
+            min_views: number of images.
+            min_share: share (0 to 1) of the images that show a point, in which it must be found too.
+        """
         found_in = np.bincount(self.views.point, minlength=len(self.reference))
-        return np.asarray((self.reference >= 0) & (found_in >= np.minimum(min_views, self.shown_by)))
+        enough = np.maximum(np.minimum(min_views, self.shown_by), min_share * self.shown_by)
+        return np.asarray((self.reference >= 0) & (found_in >= enough))
 
     def take(self, rows: IntArray) -> Observations:
         """The views of some points, ascending rows, numbered from 0."""

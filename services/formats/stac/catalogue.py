@@ -80,6 +80,7 @@ def read_catalogue(
     progress: Progress = no_progress,
     *,
     elsewhere: bool = False,
+    collections: tuple[str, ...] = (),
 ) -> StacCatalogue:
     """The images of a STAC catalogue; items that cannot be used are left out and counted.
 
@@ -90,6 +91,7 @@ def read_catalogue(
         since: items before are left out.
         progress: receives 0 and a message with the number of items.
         elsewhere: whether masks may be on other servers, as those of our own selections.
+        collections: ids, which a search API is asked for; all by default.
 
     Raises:
         FormatError: the source is no catalogue, or none of its items can be used.
@@ -97,6 +99,8 @@ def read_catalogue(
     query = {} if box is None else {"bbox": ",".join(f"{value:.6f}" for value in box)}
     if since is not None:
         query["datetime"] = f"{since:%Y-%m-%dT%H:%M:%SZ}/.."
+    if collections:
+        query["collections"] = ",".join(collections)
     reader = _Reader(since)
     with ExitStack() as stack:
         documents = stack.enter_context(Documents(source, elsewhere=elsewhere))

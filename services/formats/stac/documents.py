@@ -6,6 +6,7 @@ are not followed.
 
 import json
 import os
+import time
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -19,6 +20,11 @@ LARGEST_DOCUMENT_BYTES = 512_000_000
 LARGEST_REPLY_BYTES = 64_000_000
 TIMEOUT_S = 30.0
 _MOST_REDIRECTS = 5
+_TRY_AGAIN = (429, 500, 502, 503, 504)
+"""Status of a server that has too much to do for a while."""
+_MOST_TRIES = 5
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 30.0
+"""Pauses double; a server that names a longer one (Retry-After) gets it, up to the longest."""
 
 
 def is_address(source: str) -> bool:
@@ -110,14 +116,21 @@ class Documents:
             headers={"Accept": "application/geo+json, application/json"},
             json=body,
         )
+        redirects = tries = 0
         try:
-            for _ in range(_MOST_REDIRECTS):
+            while redirects < _MOST_REDIRECTS:
                 reply = self._client.send(request, stream=True)
+                if reply.status_code in _TRY_AGAIN and tries < _MOST_TRIES - 1:
+                    reply.close()
+                    time.sleep(_pause_s(reply.headers.get("Retry-After"), tries))
+                    tries += 1
+                    continue
                 if not reply.has_redirect_location:
                     return _content(reply, shown)
                 reply.close()
                 request = reply.next_request
                 self.resolved(str(request.url), address)
+                redirects += 1
         except httpx.HTTPError as error:
             raise FormatError(f"{shown}: no reply ({error or type(error).__name__})") from None
         raise FormatError(f"{shown}: more than {_MOST_REDIRECTS} redirects")
@@ -145,6 +158,14 @@ def _beside(base: str, path: str) -> str:
 def json_bytes(value: Any) -> bytes:
     """One line of compact JSON."""
     return json.dumps(value, separators=(",", ":"), ensure_ascii=False).encode() + b"\n"
+
+
+def _pause_s(retry_after: str | None, tries: int) -> float:
+    """Seconds until a request is sent again, after a number of tries."""
+    pause_s = _FIRST_PAUSE_S * 2.0**tries
+    if retry_after is not None and retry_after.strip().isdigit():
+        pause_s = max(pause_s, float(retry_after))
+    return min(pause_s, _LONGEST_PAUSE_S)
 
 
 def _content(reply: Any, address: str) -> bytes:

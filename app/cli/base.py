@@ -1,0 +1,131 @@
+"""`amers base make`: a base of control points for a region, from an open archive of ortho-images."""
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from amers.app.cli.options import GeoidFile, Shown
+from amers.app.cli.output import AsJson, Row, as_size, show_one
+from amers.app.cli.production_rows import accuracy_row
+from amers.app.cli.progress import shown_progress
+from amers.app.usecases.base.making import MadeBase, make_base, plan
+from amers.app.usecases.base.request import BaseOptions, BaseRequest
+from amers.app.usecases.base.search import BasePlan, Candidates
+from amers.app.usecases.new_block import BlockIdentity
+from amers.app.usecases.terrain_file import TerrainFile
+
+Options = Annotated[
+    BaseOptions,
+    Shown(
+        dates=typer.Option(min=2, max=50),
+        spacing_m=typer.Option(min=1.0),
+        min_share=typer.Option(min=0.0, max=1.0),
+        max_cloud=typer.Option(min=0.0, max=100.0),
+        min_clear=typer.Option(min=0.0, max=100.0),
+        height_sigma_m=typer.Option(min=0.01),
+        frame_sigma_up_m=typer.Option(min=0.01),
+    ),
+]
+
+
+def make(
+    *,
+    output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the block.")],
+    source: Annotated[
+        str,
+        typer.Option("--from", help="Archive: sentinel-2, landsat, or FILE.toml that describes one."),
+    ],
+    catalogue: Annotated[
+        list[str],
+        typer.Option(help="STAC: address of a search API, folder or file; repeat it for more."),
+    ],
+    area: Annotated[
+        Path | None, typer.Option(help="Region: GeoJSON with polygons.", exists=True)
+    ] = None,
+    bbox: Annotated[
+        tuple[float, float, float, float] | None, typer.Option(help="Region: W S E N, degrees.")
+    ] = None,
+    scene: Annotated[
+        Path | None, typer.Option(help="Region: the ground of this image, and around it.", exists=True)
+    ] = None,
+    dem: Annotated[
+        Path | None,
+        typer.Option(help="Heights; by default the Copernicus DEM of the catalogues.", exists=True),
+    ] = None,
+    vertical: Annotated[
+        str | None, typer.Option(help="Vertical datum of --dem: ellipsoid, EGM96, EGM2008, EPSG:…")
+    ] = None,
+    geoid: GeoidFile = None,
+    since: Annotated[
+        str | None, typer.Option(help="Leave out images before this day, UTC: YYYY-MM-DD.")
+    ] = None,
+    options: Options,
+    identity: BlockIdentity,
+    work: Annotated[
+        Path | None,
+        typer.Option(help="Folder that keeps what was read; by default OUTPUT.work until the end."),
+    ] = None,
+    only_plan: Annotated[
+        bool, typer.Option("--plan", help="Print dates, bytes and time, and read no image.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Make a base of control points for a region from an open archive of images, in one go."""
+    terrain = None if dem is None else TerrainFile(dem, vertical, geoid)
+    request = BaseRequest(source, tuple(catalogue), area, bbox, scene, terrain, geoid, since)
+    with shown_progress() as progress:
+        if not only_plan:
+            named = identity.named_after(output)
+            made = make_base(request, output, named, options, work=work, progress=progress)
+        else:
+            planned, candidates = plan(request, options, progress)
+    row = _plan_row(planned, candidates) if only_plan else _made_row(output, made, as_json=as_json)
+    show_one(row, as_json=as_json)
+
+
+def _plan_row(planned: BasePlan, candidates: Candidates) -> Row:
+    images = [candidates.images[date.image] for date in planned.dates]
+    pixels = sum(date.pixels for date in planned.dates)
+    return {
+        "area_km2": round(planned.area_km2, 1),
+        "tiles": [tile.tile for tile in planned.tiles],
+        "dates": sorted({image.date for image in images}),
+        "images": [image.id for image in images],
+        "points": planned.points,
+        "bytes": planned.bytes,
+        "size": as_size(planned.bytes),
+        "bytes_per_km2": round(planned.bytes / planned.area_km2),
+        "share_of_full_tiles": round(pixels / max(1, planned.full_pixels), 4),
+        "minutes": round(planned.seconds / 60.0, 1),
+        "items_left_out": len(candidates.problems),
+    }
+
+
+def _made_row(output: Path, made: MadeBase, *, as_json: bool) -> Row:
+    frames = made.placed.frames
+    return {
+        "block": output,
+        "points": len(made.points),
+        "views": int(made.points.views.start[-1]),
+        "points_per_km2": round(len(made.points) / made.area_km2, 2),
+        "tiles": [tile.area.tile for tile in made.placed.tiles],
+        "images": made.images,
+        "dates": made.placed.dates,
+        "orbits": frames.orbits,
+        "date_errors_east_north_m": [
+            [round(value, 2) for value in error] for error in frames.error_m.tolist()
+        ],
+        "dates_apart_m": round(frames.apart_m, 2),
+        "orbits_apart_m": round(frames.orbits_apart_m, 2),
+        "sigma_stated_m": round(frames.stated_m, 2),
+        "sigma_m": round(frames.sigma_m, 2),
+        "local_sigma_m": None if math.isnan(made.local_sigma_m) else round(made.local_sigma_m, 2),
+        "bytes_read": made.bytes,
+        "bytes_per_km2": round(made.bytes / made.area_km2),
+        "share_of_full_tiles": round(made.pixels / max(1, made.full_pixels), 4),
+        **accuracy_row(made.points, as_json=as_json),
+        "left_out": made.left_out,
+        "attribution": made.attribution,
+    }

@@ -1,0 +1,1 @@
+"""Bases of control points from open archives of ortho-images."""

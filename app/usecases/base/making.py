@@ -1,0 +1,266 @@
+"""Make a base: search, choose and read images of an archive, find points that last, write a block."""
+
+import math
+import shutil
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from amers.app.usecases.base.request import BaseOptions, BaseRequest, archive_of, area_km2, area_of
+from amers.app.usecases.base.search import (
+    BasePlan,
+    Candidates,
+    chosen_dates,
+    find_candidates,
+    plan_base,
+    read_bounds,
+    read_candidates,
+    spacing_m,
+    write_candidates,
+)
+from amers.app.usecases.base.tile_points import (
+    PlacedDates,
+    opened_tiles,
+    placed_dates,
+    points_of_tiles,
+)
+from amers.app.usecases.base.windows import WindowReader, read_terrain_windows
+from amers.app.usecases.new_block import (
+    BlockIdentity,
+    block_metadata,
+    fewest_views,
+    points_per_km2,
+    refuse_existing,
+)
+from amers.app.usecases.terrain_file import TerrainFile, read_terrain
+from amers.services.formats.addresses import TRAFFIC, without_query
+from amers.services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification
+from amers.services.formats.block.writer import write_block
+from amers.services.formats.work_folder import WorkFolder
+from amers.services.geodesy import box_around
+from amers.services.imagery.archives import COPERNICUS_DEM, Archive
+from amers.services.production.joined_points import TilePoints, joined_points
+from amers.services.production.ortho_production import GroundHeights
+from amers.services.types import ControlPoints, Frame, Progress, no_progress, part_of
+
+_CANDIDATES = "candidates.json"
+_OPTIONS = BaseOptions()
+
+
+@dataclass(frozen=True)
+class MadeBase:
+    """A base, and what it took.
+
+    Attributes:
+        points: of the block.
+        placed: its images, and the frames of their dates.
+        area_km2: of the region.
+        left_out: words for images that were chosen and not used.
+        bytes: read at addresses by this command.
+        pixels, full_pixels: read, and of the whole images.
+        local_sigma_m: of details; NaN when unknown.
+        attribution: of the data.
+    """
+
+    points: ControlPoints
+    placed: PlacedDates
+    area_km2: float
+    left_out: list[str]
+    bytes: int
+    pixels: int
+    full_pixels: int
+    local_sigma_m: float
+    attribution: str
+
+    @property
+    def images(self) -> int:
+        """Number of images."""
+        return sum(len(tile.images) for tile in self.placed.tiles)
+
+
+@dataclass(frozen=True)
+class _Making:
+    """A request with what it means."""
+
+    request: BaseRequest
+    options: BaseOptions
+    area: shapely.Geometry
+    archive: Archive
+
+    def candidates(self, progress: Progress) -> Candidates:
+        return find_candidates(self.request, self.archive, self.area, self.options, progress)
+
+    def plan(self, candidates: Candidates) -> BasePlan:
+        reads_terrain = self.request.terrain is None
+        return plan_base(candidates, self.area, self.archive, self.options, reads_terrain=reads_terrain)
+
+    def heights(self, candidates: Candidates, plan: BasePlan, kept: Path) -> GroundHeights:
+        """The heights of the ground, of the files of the user or of the catalogues."""
+        sigma_m, up_m = self.options.height_sigma_m, self.options.frame_sigma_up_m
+        if self.request.terrain is not None:
+            terrain = read_terrain(self.request.terrain, sigma_m)
+            return GroundHeights(terrain, frame_sigma_m=math.nan if up_m is None else up_m)
+        bounds = shapely.union_all([read_bounds(tile, self.archive) for tile in plan.tiles]).envelope
+        folder = read_terrain_windows(candidates, bounds, kept / "terrain")
+        stated = COPERNICUS_DEM.accuracy[0]
+        file = TerrainFile(folder, "EGM2008", self.request.geoid)
+        terrain = read_terrain(file, sigma_m or stated.own_m)
+        return GroundHeights(terrain, frame_sigma_m=up_m or stated.common_m)
+
+
+def plan(
+    request: BaseRequest, options: BaseOptions = _OPTIONS, progress: Progress = no_progress
+) -> tuple[BasePlan, Candidates]:
+    """What a base will take; only catalogues are read.
+
+    Raises:
+        InputError: the region, the archive or a catalogue cannot be used.
+    """
+    making = _Making(request, options, area_of(request), archive_of(request.source))
+    candidates = making.candidates(progress)
+    return making.plan(candidates), candidates
+
+
+def make_base(
+    request: BaseRequest,
+    folder: Path,
+    identity: BlockIdentity,
+    options: BaseOptions = _OPTIONS,
+    *,
+    work: Path | None = None,
+    progress: Progress = no_progress,
+) -> MadeBase:
+    """Make a base and write its block; an interrupted one goes on when it is made again.
+
+    Args:
+        request: where, and of what.
+        folder: of the block; must not exist.
+        identity: of the block.
+        options: of dates and points.
+        work: folder that keeps what was read; by default beside the block, and deleted at the end.
+        progress: receives the fraction done and a message.
+
+    Raises:
+        InputError: something that was given cannot be used, or the folder exists.
+        ComputationError: the images have too few points in common.
+    """
+    refuse_existing(folder)
+    before = TRAFFIC.bytes
+    making = _Making(request, options, area_of(request), archive_of(request.source))
+    kept = work or folder.with_name(f"{folder.name}.work")
+    WorkFolder(kept, _inputs(making))
+    (kept / "images").mkdir(exist_ok=True)
+    if not (kept / _CANDIDATES).is_file():
+        write_candidates(kept / _CANDIDATES, making.candidates(part_of(progress, 0.0, 0.1)))
+    candidates = read_candidates(kept / _CANDIDATES, making.archive)
+    planned = making.plan(candidates)
+    reading = part_of(progress, 0.1, 0.4)
+    reader = WindowReader(
+        kept / "images", making.archive, candidates, options, reading, len(planned.dates)
+    )
+    chosen = chosen_dates(candidates, planned.tiles, options, reader.take)
+    with ExitStack() as stack:
+        heights = making.heights(candidates, planned, kept)
+        tiles = opened_tiles(planned.tiles, chosen, reader, stack)
+        gsd_m = making.archive.gsd_m
+        placed = placed_dates(tiles, heights, gsd_m, part_of(progress, 0.5, 0.1))
+        parts = points_of_tiles(placed, heights, reader, part_of(progress, 0.6, 0.3))
+        frame = Frame.from_sigmas(placed.frames.sigma_m, heights.frame_sigma_m)
+        least_m = 0.7 * spacing_m(options, making.archive)
+        points, chips = joined_points(parts, heights, frame, least_m)
+        made = _made(making, points, placed, reader, parts)
+        made = replace(made, bytes=TRAFFIC.bytes - before)
+        metadata = _metadata(identity, making, made, parts[0].production.gsds_m)
+        write_block(folder, metadata, points, chips, {}, progress=part_of(progress, 0.9, 0.1))
+    if work is None:
+        shutil.rmtree(kept)
+    return made
+
+
+def _inputs(making: _Making) -> dict[str, Any]:
+    """What the content of a work folder depends on; signatures of addresses change."""
+    request = asdict(making.request)
+    request["catalogues"] = [without_query(one) for one in making.request.catalogues]
+    return {
+        "request": request,
+        "options": asdict(making.options),
+        "archive": asdict(making.archive),
+        "area": shapely.to_wkt(making.area),
+    }
+
+
+def _made(
+    making: _Making,
+    points: ControlPoints,
+    placed: PlacedDates,
+    reader: WindowReader,
+    parts: list[TilePoints],
+) -> MadeBase:
+    local_m = np.array([part.production.local_sigma_m for part in parts])
+    images = [image for tile in placed.tiles for image in tile.images]
+    years = sorted({image.acquired.year for image in images})
+    span = str(years[0]) if years[0] == years[-1] else f"{years[0]}-{years[-1]}"
+    attribution = making.archive.attribution.replace("{years}", span)
+    if making.request.terrain is None:
+        attribution += f"; heights: {COPERNICUS_DEM.attribution}"
+    return MadeBase(
+        points=points,
+        placed=placed,
+        area_km2=area_km2(making.area),
+        left_out=reader.left_out + placed.left_out,
+        bytes=0,
+        pixels=reader.pixels,
+        full_pixels=reader.full_pixels,
+        local_sigma_m=float(np.nanmax(local_m)) if np.isfinite(local_m).any() else math.nan,
+        attribution=attribution,
+    )
+
+
+def _metadata(
+    identity: BlockIdentity, making: _Making, made: MadeBase, gsds_m: tuple[float, ...]
+) -> BlockMetadata:
+    points, placed, archive = made.points, made.placed, making.archive
+    return block_metadata(
+        identity,
+        [scene.acquisition for tile in placed.tiles for scene in tile.scenes],
+        points,
+        description=(
+            f"{len(points)} ground control points with chips, from {made.images} images of "
+            f"{archive.name} on {len(placed.dates)} dates. {made.attribution}"
+        ),
+        outline=box_around(points.lon_lat_h),
+        specification=BlockSpecification(
+            gsds_m, fewest_views(points), points_per_km2(spacing_m(making.options, archive))
+        ),
+        options={
+            **asdict(making.options),
+            "archive": archive.name,
+            "catalogues": [without_query(one) for one in making.request.catalogues],
+            "attribution": made.attribution,
+            "terms": archive.terms,
+        },
+        accuracy=_accuracy(made, archive),
+    )
+
+
+def _accuracy(made: MadeBase, archive: Archive) -> tuple[AccuracyFigure, ...]:
+    """The stated accuracies of a base, with what they were compared with."""
+    frames, count = made.placed.frames, len(made.placed.dates)
+    against = f"the statement of the producer of {archive.name}, not exceeded by the dates"
+    if frames.sigma_m > frames.stated_m:
+        against = f"the disagreement of {count} dates of {max(1, frames.orbits)} orbits"
+    figures = [
+        AccuracyFigure("absolute", "frame_sigma_m", frames.sigma_m, count, against),
+        AccuracyFigure("absolute", "dates_apart_m", frames.apart_m, count, "each other, at most"),
+    ]
+    if math.isfinite(made.local_sigma_m):
+        disagreement = "the disagreement of the images, after one shift of each"
+        name = "local_sigma_m"
+        figures.append(
+            AccuracyFigure("relative", name, made.local_sigma_m, len(made.points), disagreement)
+        )
+    return tuple(figures)

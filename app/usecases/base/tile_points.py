@@ -1,0 +1,201 @@
+"""The copies of tiles as scenes, the frame that their dates give, and the points of every tile."""
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+
+import numpy as np
+import shapely
+
+from amers.app.errors import InputError
+from amers.app.usecases.base.request import BaseOptions, area_km2
+from amers.app.usecases.base.search import COARSE_FACTOR, spacing_m
+from amers.app.usecases.base.windows import WindowReader
+from amers.services.errors import NotEnoughPoints
+from amers.services.formats.images.scenes import read_scene
+from amers.services.imagery.archives import ArchiveImage
+from amers.services.imagery.scene import Scene
+from amers.services.production.date_choice import TileArea
+from amers.services.production.date_frames import DateFrames, DateShifts, date_frames
+from amers.services.production.joined_points import TilePoints
+from amers.services.production.ortho_production import (
+    GroundHeights,
+    OrthoPointOptions,
+    OrthoPoints,
+    produce_ortho_points,
+    shifts_of_scenes,
+)
+from amers.services.types import Array, Progress, part_of
+
+_TIE_POINTS = 80
+"""Squares whose corners show by how much a date lies off another."""
+_MOST_FIRST = 3
+"""Dates of a tile whose details become points: later ones where clouds or swaths hide the first."""
+_ENOUGH = 0.8
+"""Share of the squares that have points, from which on no other date is tried."""
+_LEAST_VIEWS = 2
+_LOCAL_SIGMA_PX = 0.1
+"""Least error of details where two orbits agree, pixels of the image. Two dates of Berlin have 0.064
+(`pytest -s tests/journeys/test_real_base.py`); orbits look from two sides, and would show errors of the
+terrain that was used for the images."""
+
+
+@dataclass(frozen=True)
+class BaseTile:
+    """The images of a tile.
+
+    Attributes:
+        area: that it gives.
+        scenes: their copies, opened.
+        images: what their items state.
+    """
+
+    area: TileArea
+    scenes: list[Scene]
+    images: list[ArchiveImage]
+
+    def take(self, rows: Sequence[int]) -> "BaseTile":
+        """The tile with some of its images."""
+        return replace(
+            self, scenes=[self.scenes[row] for row in rows], images=[self.images[row] for row in rows]
+        )
+
+
+@dataclass(frozen=True)
+class PlacedDates:
+    """The dates of a base and their frames.
+
+    Attributes:
+        tiles: with the images that are found in each other.
+        dates: names.
+        frames: of the dates.
+        left_out: words for images that are not found.
+    """
+
+    tiles: list[BaseTile]
+    dates: list[str]
+    frames: DateFrames
+    left_out: list[str]
+
+    def move_m(self, image: ArchiveImage) -> Array:
+        """(2,) east, north, from an image into the frame of the base."""
+        return np.asarray(-self.frames.error_m[self.dates.index(image.date)])
+
+
+def opened_tiles(
+    areas: Sequence[TileArea], chosen: dict[str, list[int]], reader: WindowReader, stack: ExitStack
+) -> list[BaseTile]:
+    """The copies of all tiles that have images, the clearest of the most accurate first.
+
+    Raises:
+        InputError: there is none.
+    """
+    tiles = []
+    for area in areas:
+        images = {number: reader.candidates.images[number] for number in chosen[area.tile]}
+        order = sorted(
+            images, key=lambda n: (-round(reader.clear(n) / images[n].accuracy.total_m, 3), images[n].id)
+        )
+        scenes = []
+        for number in order:
+            image = images[number]
+            scene = read_scene(reader.path(number), sigma_m=image.accuracy.total_m)
+            stack.callback(scene.image.close)  # type: ignore[attr-defined]
+            acquisition = replace(
+                scene.acquisition, sensor=image.platform, acquired_at=image.acquired, image_id=image.id
+            )
+            scenes.append(replace(scene, acquisition=acquisition))
+        if scenes:
+            tiles.append(BaseTile(area, scenes, [images[number] for number in order]))
+    if not tiles:
+        words = "; ".join(reader.left_out[:3])
+        raise InputError(
+            f"no image of the region can be used: {words}; allow more (--min-clear, --max-cloud)"
+        )
+    return tiles
+
+
+def placed_dates(
+    tiles: Sequence[BaseTile], heights: GroundHeights, gsd_m: float, progress: Progress
+) -> PlacedDates:
+    """The frame of all dates, from the shifts of the images of every tile against its first."""
+    few = OrthoPointOptions(gsd_m, COARSE_FACTOR * gsd_m, points=_TIE_POINTS)
+    used: list[BaseTile] = []
+    ties: list[tuple[str, str, Array]] = []
+    left_out: list[str] = []
+    for number, tile in enumerate(tiles):
+        part = part_of(progress, number / len(tiles), 1.0 / len(tiles))
+        shift_m = shifts_of_scenes(tile.scenes, heights, few, part)
+        found = np.isfinite(shift_m[:, 0])
+        for image, is_found in zip(tile.images, found.tolist(), strict=True):
+            if not is_found:
+                left_out.append(f"{image.id}: too few of its details are found")
+        rows = np.flatnonzero(found).tolist()
+        used.append(tile.take(rows))
+        ties += [(tile.images[0].date, tile.images[row].date, shift_m[row]) for row in rows[1:]]
+    of_date = {image.date: image for tile in used for image in tile.images}
+    dates = sorted(of_date)
+    shifts = DateShifts(
+        np.array([dates.index(first) for first, _, _ in ties], dtype=np.int64),
+        np.array([dates.index(other) for _, other, _ in ties], dtype=np.int64),
+        np.array([shift_m for _, _, shift_m in ties]).reshape(-1, 2),
+    )
+    images = [of_date[date] for date in dates]
+    frames = date_frames([one.accuracy for one in images], [one.orbit for one in images], shifts)
+    return PlacedDates(used, dates, frames, left_out)
+
+
+def points_of_tiles(
+    placed: PlacedDates, heights: GroundHeights, reader: WindowReader, progress: Progress
+) -> list[TilePoints]:
+    """The points of every tile, with the way into the frame of the base.
+
+    Raises:
+        NotEnoughPoints: no tile has any.
+    """
+    gsd_m, step_m = reader.archive.gsd_m, spacing_m(reader.options, reader.archive)
+    options = _point_options(reader.options, gsd_m, step_m)
+    if placed.frames.orbits > 1:
+        options = replace(options, local_sigma_px=_LOCAL_SIGMA_PX)
+    parts = []
+    for number, tile in enumerate(placed.tiles):
+        part = part_of(progress, number / len(placed.tiles), 1.0 / len(placed.tiles))
+        wanted = area_km2(tile.area.polygon) * 1e6 / step_m**2
+        for row, production in _productions(tile, heights, options, wanted, part):
+            move_m = placed.move_m(tile.images[row])
+            parts.append(TilePoints(production, tile.area.polygon, move_m))
+    if not parts:
+        what = "points that most dates show; give a larger region, more dates or a smaller --min-share"
+        raise NotEnoughPoints(0, 6, what)
+    return parts
+
+
+def _point_options(options: BaseOptions, gsd_m: float, step_m: float) -> OrthoPointOptions:
+    return OrthoPointOptions(
+        gsd_m,
+        COARSE_FACTOR * gsd_m,
+        spacing_m=step_m,
+        min_views=_LEAST_VIEWS,
+        min_share=options.min_share,
+    )
+
+
+def _productions(
+    tile: BaseTile, heights: GroundHeights, options: OrthoPointOptions, wanted: float, progress: Progress
+) -> list[tuple[int, OrthoPoints]]:
+    """Points of a tile: of its first image, then of others while squares have none."""
+    made: list[tuple[int, OrthoPoints]] = []
+    count = 0
+    for row in range(min(_MOST_FIRST, len(tile.scenes))):
+        scenes = [tile.scenes[row], *(s for i, s in enumerate(tile.scenes) if i != row)]
+        part = part_of(progress, row / _MOST_FIRST, 1.0 / _MOST_FIRST)
+        try:
+            production = produce_ortho_points(scenes, heights, options, part)
+        except NotEnoughPoints:
+            continue
+        made.append((row, production))
+        inside = shapely.contains_xy(tile.area.polygon, production.points.lon_lat_h[:, :2])
+        count += int(np.sum(inside))
+        if count >= _ENOUGH * wanted:
+            break
+    return made

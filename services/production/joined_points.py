@@ -1,0 +1,125 @@
+"""Points of several tiles of ortho-images as those of one block, in one frame."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import shapely
+
+from amers.services.errors import NotEnoughPoints
+from amers.services.geodesy import move_metres
+from amers.services.production.ortho_production import GroundHeights, OrthoPoints
+from amers.services.types import Acquisition, Array, ChipArray, ControlPoints, Frame, IntArray, Views
+
+
+@dataclass(frozen=True)
+class TilePoints:
+    """The points of one tile, and what becomes of them.
+
+    Attributes:
+        production: with the positions of its first image.
+        polygon: longitude and latitude; points beyond it belong to other tiles.
+        move_m: (2,) east, north, from the first image into the frame of the block.
+    """
+
+    production: OrthoPoints
+    polygon: shapely.Geometry
+    move_m: Array
+
+
+def joined_points(
+    tiles: Sequence[TilePoints], heights: GroundHeights, frame: Frame, min_distance_m: float
+) -> tuple[ControlPoints, Callable[[int], ChipArray]]:
+    """The points of all tiles, and from their rows to their chips.
+
+    Chips stay as they are: they show the same detail, wherever the frame places it. Heights are those of
+    the ground where the points come to lie.
+
+    Args:
+        tiles: of one block; of points nearer to each other than `min_distance_m`, the first stays.
+        heights: of the ground.
+        frame: of the block.
+        min_distance_m: on the ground.
+
+    Raises:
+        NotEnoughPoints: no point lies in its polygon, on ground of known height.
+    """
+    parts: list[ControlPoints] = []
+    source: list[tuple[int, int]] = []
+    placed = np.empty((0, 3))
+    images: dict[str, Acquisition] = {}
+    for number, tile in enumerate(tiles):
+        points = tile.production.points
+        move_m = np.tile([*tile.move_m, 0.0], (len(points), 1))
+        lon_lat_h = move_metres(points.lon_lat_h, move_m)
+        lon_lat_h[:, 2] = heights.at(lon_lat_h[:, :2])
+        covariance_m2 = points.covariance_m2.copy()
+        covariance_m2[:, 2, 2] = heights.sigma_m(lon_lat_h[:, :2]) ** 2
+        points = replace(points, lon_lat_h=lon_lat_h, covariance_m2=covariance_m2, frames=(frame,))
+        inside = np.asarray(shapely.contains_xy(tile.polygon, lon_lat_h[:, :2]))
+        rows = np.flatnonzero(inside & np.isfinite(lon_lat_h[:, 2]))
+        rows = rows[_far_from(lon_lat_h[rows], placed, min_distance_m)]
+        images |= {one.image_id: one for one in points.views.images}
+        parts.append(_numbered(points.take(rows), list(images)))
+        source += [(number, row) for row in rows.tolist()]
+        placed = np.concatenate([placed, lon_lat_h[rows]])
+    if not source:
+        raise NotEnoughPoints(0, 1, "points in the area, on ground of known height")
+
+    def chips(row: int) -> ChipArray:
+        number, of_tile = source[row]
+        return tiles[number].production.chips(of_tile)
+
+    return _concatenated(parts, tuple(images.values())), chips
+
+
+def _far_from(lon_lat_h: Array, placed: Array, least_m: float) -> IntArray:
+    """Rows of points that no placed one is near."""
+    if not len(placed) or not len(lon_lat_h):
+        return np.arange(len(lon_lat_h))
+    middle = np.radians(placed[:, 1].mean())
+    scale = np.array([111_320.0 * np.cos(middle), 110_570.0])
+    offset_m = (lon_lat_h[:, None, :2] - placed[None, :, :2]) * scale
+    nearest_m = np.linalg.norm(offset_m, axis=2).min(axis=1)
+    return np.flatnonzero(nearest_m >= least_m)
+
+
+def _numbered(points: ControlPoints, names: list[str]) -> ControlPoints:
+    """Points whose images are numbered by these names."""
+    views = points.views
+    number = np.array([names.index(one.image_id) for one in views.images], dtype=np.int64)
+    return replace(points, views=replace(views, image=number[views.image]))
+
+
+def _concatenated(parts: Sequence[ControlPoints], images: tuple[Acquisition, ...]) -> ControlPoints:
+    def column(name: str) -> Array:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    def of_views(name: str) -> Array:
+        return np.concatenate([getattr(part.views, name) for part in parts])
+
+    counts = np.concatenate([np.diff(part.views.start) for part in parts])
+    start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    n = len(counts)
+    views = Views(
+        start=start,
+        images=images,
+        gsd_m=of_views("gsd_m"),
+        image=of_views("image").astype(np.int64),
+        incidence_deg=of_views("incidence_deg"),
+        azimuth_deg=of_views("azimuth_deg"),
+        health=of_views("health"),
+    )
+    return ControlPoints(
+        id=np.arange(n, dtype=np.int64),
+        lon_lat_h=column("lon_lat_h"),
+        covariance_m2=column("covariance_m2"),
+        block=np.zeros(n, dtype=np.int64),
+        frames=parts[0].frames,
+        saliency=column("saliency"),
+        health=column("health"),
+        views=views,
+        chip_file=np.zeros(n, dtype=np.int64),
+        chip_row=start[:-1].copy(),
+        chip_files=("chips",),
+    )
