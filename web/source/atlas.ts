@@ -10,6 +10,7 @@ import {
   setWorkerUrl,
   VectorTileSource,
 } from "maplibre-gl";
+import { aimWithKeys } from "./aim";
 import { authorization, BASE, get } from "./api";
 import { type Bounds, Comparison, type Pyramid, type Pyramids, TILE_PX } from "./comparison";
 import { h } from "./elements";
@@ -45,7 +46,7 @@ export class Atlas {
   private colouring: Colouring = "none";
   private land = landFile(0);
   private namesTowns = false;
-  private picked: ((position: Position) => void) | null = null;
+  private picked: ((position: Position, point?: number) => void) | null = null;
   /** Whether the reader has gone to a place: the page then does not move the map by itself. */
   went = false;
 
@@ -63,17 +64,10 @@ export class Atlas {
     void this.ready.then(() => drawBackground(map, container)).catch((error: Error) => console.warn(error.message));
     for (const event of ["movestart", "dataloading"] as const) map.on(event, () => container.setAttribute("aria-busy", "true"));
     map.on("idle", () => container.setAttribute("aria-busy", "false"));
-    map.on("click", (event) => {
-      if (this.picked) return this.picked([wrapped(event.lngLat.lng), event.lngLat.lat]);
-      const { x, y } = event.point;
-      const [point] = map.queryRenderedFeatures(
-        [
-          [x - NEAR_PX, y - NEAR_PX],
-          [x + NEAR_PX, y + NEAR_PX],
-        ],
-        { layers: ["points"] },
-      );
-      if (point) onPoint(Number(point.properties["id"]));
+    map.on("click", ({ lngLat, point }) => {
+      const id = this.pointAt(map, point);
+      if (this.picked) this.picked([wrapped(lngLat.lng), lngLat.lat], id);
+      else if (id !== undefined) onPoint(id);
     });
     const pointer = h("p", { class: "pointer", "aria-hidden": "true" });
     const field = goToField(
@@ -131,7 +125,7 @@ export class Atlas {
   }
 
   /** Replace the features of a layer that the page fills itself. */
-  async show(source: "blocks" | "scenes" | "vectors" | "graticule" | "target", features: Outlined[]): Promise<void> {
+  async show(source: "blocks" | "scenes" | "vectors" | "marks" | "graticule" | "target", features: Outlined[]): Promise<void> {
     await this.ready;
     const layer = this.map?.getSource(source);
     if (layer instanceof GeoJSONSource) layer.setData({ type: "FeatureCollection", features } as FeatureCollection);
@@ -160,10 +154,20 @@ export class Atlas {
     return (opacity) => map.setPaintProperty("surface", "raster-opacity", opacity);
   }
 
-  /** Call back with the position of every click, instead of opening points, until the signal aborts. */
-  pick(callback: (position: Position) => void, signal: AbortSignal): void {
+  /** Call back with the position of every click, and the control point there, instead of opening points, until the signal aborts. */
+  pick(callback: (position: Position, point?: number) => void, signal: AbortSignal): void {
     this.picked = callback;
     signal.addEventListener("abort", () => (this.picked = null));
+  }
+
+  /** Let the keys pick, too: arrows move the map below a crosshair in its middle, Enter picks what is there. */
+  aim(label: string, signal: AbortSignal): void {
+    if (!this.map) return;
+    const map = this.map;
+    aimWithKeys(map, label, signal, () => {
+      const { lng, lat } = map.getCenter();
+      this.picked?.([wrapped(lng), lat], this.pointAt(map, map.project([lng, lat])));
+    });
   }
 
   /** Load points and densities again, after a block was published or withdrawn. */
@@ -174,12 +178,22 @@ export class Atlas {
     }
   }
 
-  /** Mark a position, and show its surroundings. */
-  private async goTo(position: Position): Promise<void> {
+  /** The control point at a place of the screen. */
+  private pointAt(map: MapLibre, { x, y }: { x: number; y: number }): number | undefined {
+    const box: [[number, number], [number, number]] = [
+      [x - NEAR_PX, y - NEAR_PX],
+      [x + NEAR_PX, y + NEAR_PX],
+    ];
+    const [point] = map.queryRenderedFeatures(box, { layers: ["points"] });
+    return point && Number(point.properties["id"]);
+  }
+
+  /** Mark a position, and show its surroundings at a zoom, if the map is not closer. */
+  async goTo(position: Position, zoom = COORDINATE_ZOOM): Promise<void> {
     this.went = true;
     await this.show("target", [{ type: "Feature", properties: {}, geometry: { type: "Point", coordinates: position } }]);
     const [longitude, latitude] = position as [number, number];
-    this.map?.jumpTo({ center: [longitude, latitude], zoom: Math.max(this.map.getZoom(), COORDINATE_ZOOM) });
+    this.map?.jumpTo({ center: [longitude, latitude], zoom: Math.max(this.map.getZoom(), zoom) });
   }
 
   /** Load the land of the present scale, when the scale asks for another. */

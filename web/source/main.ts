@@ -8,6 +8,7 @@ import { drawBlocks, showBlock, showBlocks } from "./blocks";
 import { showDrawing } from "./draw";
 import { h, problem } from "./elements";
 import { showJob } from "./job";
+import { showMarking } from "./marking";
 import { go, markSection } from "./page";
 import { showPoint, showPoints } from "./points";
 import { showScene, showScenes } from "./scenes";
@@ -19,6 +20,7 @@ const VIEWS: Record<string, { show: ShowView; section: string }> = {
   scenes: { show: showScenes, section: "scenes" },
   scene: { show: showScene, section: "scenes" },
   draw: { show: showDrawing, section: "scenes" },
+  mark: { show: showMarking, section: "scenes" },
   job: { show: showJob, section: "scenes" },
   blocks: { show: showBlocks, section: "blocks" },
   block: { show: showBlock, section: "blocks" },

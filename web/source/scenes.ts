@@ -63,6 +63,9 @@ export const showScene: ShowView = async ({ panel, atlas, signal }, id) => {
     }),
     scene.removed
       ? h("p", { class: "quiet" }, `The files were removed on ${when(scene.removed)}.`)
+      : h("p", {}, h("a", { class: "button", href: `#/mark/${scene.id}` }, "Mark points")),
+    scene.removed
+      ? null
       : h("details", { class: "card", open: !last }, h("summary", {}, last ? "Register again" : "Register"), registrationForm(scene)),
     scene.registrations.length ? h("h2", {}, "Registrations") : null,
     h("ul", { class: "list story" }, ...scene.registrations.map(registrationRow)),

@@ -108,6 +108,7 @@ export function mapStyle(dark: boolean, colouring: Colouring): StyleSpecificatio
       blocks: empty(),
       scenes: empty(),
       vectors: empty(),
+      marks: empty(),
     },
     layers: layers(dark, colouring),
   };
@@ -239,6 +240,24 @@ function layers(dark: boolean, colouring: Colouring): LayerSpecification[] {
         "circle-stroke-color": c.halo,
         "circle-stroke-width": 1,
       },
+    },
+    {
+      id: "marks",
+      type: "circle",
+      source: "marks",
+      paint: {
+        "circle-radius": 5,
+        "circle-color": ["match", ["get", "colour"], "rejected", c.active, "check", c.block, c.scene],
+        "circle-stroke-color": c.halo,
+        "circle-stroke-width": 1.5,
+      },
+    },
+    {
+      id: "mark-names",
+      type: "symbol",
+      source: "marks",
+      layout: { "text-field": ["get", "name"], "text-font": FONT, "text-size": 13, "text-anchor": "bottom-left", "text-offset": [0.5, -0.3], "text-allow-overlap": true },
+      paint: { "text-color": c.text, "text-halo-color": c.halo, "text-halo-width": 1.5 },
     },
     {
       id: "target",

@@ -11,19 +11,39 @@ const DRAG_PX = 4;
 const ZOOM = 1.5;
 const LARGEST_SCALE = 16;
 const EDGE_PX = 24;
-const COLOURS = { drawn: "#ffd60a", begun: "#ff9f0a", ofMap: "#4cc9f0", halo: "#000000b0" };
+const COLOURS = { drawn: "#ffd60a", begun: "#ff9f0a", ofMap: "#4cc9f0", halo: "#000000b0", rejected: "#ff7b72" };
+const OF_SHAPES =
+  "Raw image. Arrow keys move the crosshair, space sets a vertex, Enter ends the shape, Backspace takes the last vertex back, plus and minus magnify.";
+/** Smallest circle around an expected place, and the share of the view that a circle has when the image is moved to it. */
+const LEAST_RADIUS_PX = 12;
+const EXPECTED_SHARE = 0.3;
+
+/** A place that was marked, with where the model computes it. */
+export interface Marked {
+  name: string;
+  at: Pixel;
+  computed: Pixel | null;
+  colour: "drawn" | "begun" | "ofMap" | "rejected";
+}
+/** A place that the model expects, within a radius in pixels of the image. */
+export interface Expected {
+  at: Pixel;
+  radius: number;
+}
 
 export interface Seen {
   /** Shapes that were drawn, and vectors of the map, in pixels. */
   drawn: Feature[];
   ofMap: Feature[];
+  marked: Marked[];
+  expected: Expected | null;
 }
 
 /** The view of a raw image; `finished` gets every shape that was drawn to its end. */
 export class Viewer {
   readonly element: HTMLCanvasElement;
   kind: Kind = "Point";
-  private seen: Seen = { drawn: [], ofMap: [] };
+  private seen: Seen = { drawn: [], ofMap: [], marked: [], expected: null };
   private begun: Pixel[] = [];
   private pointer: Pixel | null = null;
   /** Screen position of the crosshair that the keys move; null until one does. */
@@ -38,8 +58,8 @@ export class Viewer {
     private readonly tiles: Tiles,
     private readonly finished: (kind: Kind, vertices: Pixel[]) => void,
     signal: AbortSignal,
+    label = OF_SHAPES,
   ) {
-    const label = "Raw image. Arrow keys move the crosshair, space sets a vertex, Enter ends the shape, Backspace takes the last vertex back, plus and minus magnify.";
     this.element = h("canvas", { tabindex: 0, role: "application", "aria-label": label });
     const magnify = (text: string, name: string, factor: number): HTMLElement =>
       h("button", { type: "button", "aria-label": name, onclick: () => this.magnify(factor) }, text);
@@ -75,6 +95,16 @@ export class Viewer {
     this.draw();
   }
 
+  /** Move the image so that an expected place is in the middle, as large as its radius allows. */
+  goTo({ at, radius }: Expected): void {
+    this.centre = at;
+    const { clientWidth, clientHeight } = this.element;
+    const fitting = (EXPECTED_SHARE * Math.min(clientWidth, clientHeight)) / Math.max(radius, LEAST_RADIUS_PX);
+    this.scale = Math.min(Math.max(fitting, this.smallestScale()), LARGEST_SCALE / 4);
+    this.cross = null;
+    this.draw();
+  }
+
   private listen(): void {
     const canvas = this.element;
     canvas.addEventListener("pointerdown", (event) => {
@@ -106,7 +136,7 @@ export class Viewer {
     const steps: Record<string, Pixel> = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step] };
     const actions: Record<string, () => void> = {
       " ": () => this.add(this.crosshair()),
-      Enter: () => this.finish(),
+      Enter: () => (this.kind === "Point" ? this.add(this.crosshair()) : this.finish()),
       Backspace: () => void this.begun.pop(),
       Escape: () => (this.begun = []),
       "+": () => this.magnify(ZOOM, this.crosshair()),
@@ -226,6 +256,7 @@ export class Viewer {
     const end = this.cross ?? this.pointer;
     const begun = [...this.begun, ...(end && this.begun.length ? [this.toImage(end)] : [])];
     if (begun.length) this.paintPaths(context, [begun], COLOURS.begun);
+    this.paintMarks(context);
     if (this.cross) this.paintCrosshair(context, this.cross);
   }
 
@@ -256,11 +287,7 @@ export class Viewer {
       const places = line.map((position) => this.toScreen(position));
       const path = new Path2D();
       places.forEach(([x, y], at) => (at ? path.lineTo(x, y) : path.moveTo(x, y)));
-      for (const [width, style] of [[4, COLOURS.halo], [2, colour]] as const) {
-        context.lineWidth = width;
-        context.strokeStyle = style;
-        context.stroke(path);
-      }
+      this.stroke(context, path, colour);
       context.fillStyle = colour;
       context.lineWidth = 1;
       context.strokeStyle = COLOURS.halo;
@@ -273,12 +300,37 @@ export class Viewer {
     }
   }
 
-  private paintCrosshair(context: CanvasRenderingContext2D, [x, y]: Pixel): void {
-    const path = new Path2D(`M${x - 14} ${y}h10M${x + 4} ${y}h10M${x} ${y - 14}v10M${x} ${y + 4}v10`);
-    for (const [width, style] of [[4, COLOURS.halo], [2, COLOURS.begun]] as const) {
+  private paintMarks(context: CanvasRenderingContext2D): void {
+    context.font = "600 13px system-ui, sans-serif";
+    const { marked, expected } = this.seen;
+    for (const { name, at, computed, colour } of marked) {
+      if (computed) this.paintPaths(context, [[at, computed]], COLOURS[colour]);
+      const [x, y] = this.toScreen(at);
+      this.stroke(context, new Path2D(`M${x - 9} ${y}h6M${x + 3} ${y}h6M${x} ${y - 9}v6M${x} ${y + 3}v6`), COLOURS[colour]);
+      context.lineWidth = 4;
+      context.strokeStyle = COLOURS.halo;
+      context.strokeText(name, x + 8, y - 8);
+      context.fillStyle = COLOURS[colour];
+      context.fillText(name, x + 8, y - 8);
+    }
+    if (!expected) return;
+    const circle = new Path2D();
+    circle.arc(...this.toScreen(expected.at), Math.max(expected.radius * this.scale, LEAST_RADIUS_PX), 0, 2 * Math.PI);
+    context.setLineDash([6, 4]);
+    this.stroke(context, circle, COLOURS.begun);
+    context.setLineDash([]);
+  }
+
+  /** A line with a dark border, which is seen on any image. */
+  private stroke(context: CanvasRenderingContext2D, path: Path2D, colour: string): void {
+    for (const [width, style] of [[4, COLOURS.halo], [2, colour]] as const) {
       context.lineWidth = width;
       context.strokeStyle = style;
       context.stroke(path);
     }
+  }
+
+  private paintCrosshair(context: CanvasRenderingContext2D, [x, y]: Pixel): void {
+    this.stroke(context, new Path2D(`M${x - 14} ${y}h10M${x + 4} ${y}h10M${x} ${y - 14}v10M${x} ${y + 4}v10`), COLOURS.begun);
   }
 }

@@ -1,0 +1,219 @@
+"""Marks that a person sets on the page: in the raw image and on the map, with pointer and keys."""
+
+import json
+import re
+
+import httpx
+import numpy as np
+import pytest
+from playwright.sync_api import Locator, Page, expect
+
+from amers.services.types import Array
+from tests.app.flat_world import GROUND_H, FlatWorld
+from tests.journeys.map_page import ARTEFACTS, WIDE, assert_readable, tab_to, until_drawn
+from tests.service_process import Service
+
+pytestmark = [pytest.mark.long, pytest.mark.thorough]
+
+PICKED = np.array(
+    [
+        *[[150.0, 200.0], [180.0, 1000.0], [1000.0, 250.0], [950.0, 920.0], [600.0, 550.0]],
+        *[[350.0, 700.0], [800.0, 400.0], [300.0, 420.0], [700.0, 850.0], [1050.0, 600.0]],
+    ]
+)
+a_pixel = 1.0
+a_blunder_px = 40
+a_hundredth_px = 0.01
+EXPECTED = re.compile(r"expected in the circle of (\d+) px, at line (-?\d+), sample (-?\d+)")
+
+
+def uploaded(service: Service, secret: str, world: FlatWorld) -> str:
+    """The id of the scene of the world, whose model is off by 17 px."""
+    headers = {"Authorization": f"Bearer {secret}"}
+    address = f"{service.url}/scenes?name=marked.tif&sigma_m=6"
+    sent = httpx.post(address, headers=headers, content=world.tagged.read_bytes())
+    scene: str = sent.raise_for_status().json()["id"]
+    return scene
+
+
+def opened(page: Page) -> Locator:
+    """The raw image, once its tiles are drawn and the map has the scene."""
+    image = page.get_by_role("application")
+    expect(image).to_have_attribute("aria-busy", "false")
+    expect(page.get_by_role("heading", name="Mark M1")).to_be_visible()
+    until_drawn(page)
+    return image
+
+
+def off_expected(page: Page, image: Locator, line_sample: Array) -> Array:
+    """How far below and right of the middle of the image a place is, screen pixels.
+
+    The place that the page expects is in the middle.
+    """
+    prompt = page.locator(".prompt")
+    expect(prompt).to_have_text(EXPECTED)
+    radius, line, sample = map(int, EXPECTED.search(prompt.inner_text()).groups())
+    box = image.bounding_box()
+    scale = min(0.3 * min(box["width"], box["height"]) / max(radius, 60), 4.0)
+    return np.asarray((line_sample - [line, sample]) * scale)
+
+
+def choose_in_image(page: Page, image: Locator, line_sample: Array) -> None:
+    """Click a place near the one that the page expects, which is in the middle of the image."""
+    down, right = off_expected(page, image, line_sample)
+    box = image.bounding_box()
+    image.click(position={"x": box["width"] / 2 + right, "y": box["height"] / 2 + down})
+
+
+def choose_with_keys(page: Page, line_sample: Array) -> None:
+    """Move the crosshair from the expected place by screen pixels, as near as these are, and set it."""
+    off = off_expected(page, page.get_by_role("application"), line_sample)
+    for steps, back, on in zip(
+        np.round(off).astype(int).tolist(),
+        ("ArrowUp", "ArrowLeft"),
+        ("ArrowDown", "ArrowRight"),
+        strict=True,
+    ):
+        for _ in range(abs(steps)):
+            page.keyboard.press(f"Shift+{on if steps > 0 else back}")
+    page.keyboard.press("Enter")
+
+
+def rows(page: Page) -> Locator:
+    return page.get_by_role("region", name="List of marks").locator("tbody tr")
+
+
+def ground_text(world: FlatWorld, line_sample: Array, *, height: bool = True) -> str:
+    lon, lat, h = world.true_model.locate(line_sample[None], np.array([GROUND_H]))[0].tolist()
+    return f"{lon:.8f}, {lat:.8f}" + (f", {h:.2f}" if height else "")
+
+
+def residuals_shown(page: Page) -> Array:
+    """Residuals (n, 2) in the table."""
+    texts = [row.locator("td").nth(5).inner_text() for row in rows(page).all()]
+    return np.array(
+        [[float(part.replace("\N{MINUS SIGN}", "-")) for part in text.split()] for text in texts]
+    )
+
+
+def until_adjusted(page: Page) -> None:
+    expect(page.locator(".summary")).to_have_attribute("aria-busy", "false")
+
+
+def type_ground(page: Page, text: str) -> None:
+    page.get_by_label("Place on the ground").fill(text)
+    page.keyboard.press("Enter")
+
+
+def test_ten_marks_are_set_with_pointer_and_keys_and_saved_as_the_command_reads_them(
+    visit, world, secret, service, amers, tmp_path
+):
+    """Without a terrain of the service: heights are typed, or those of control points."""
+    scene = uploaded(service, secret, world)
+    page = visit(f"#/scene/{scene}", secret, WIDE)
+    page.get_by_role("link", name="Mark points").click()
+    image = opened(page)
+    expect(page.get_by_text("give the heights")).to_be_visible()
+    for place in PICKED[:4]:
+        type_ground(page, ground_text(world, place))
+        expect(image).to_be_focused()
+        choose_in_image(page, image, place)
+        expect(page.locator(".prompt")).to_have_text("Choose a place in the image or on the map.")
+        until_adjusted(page)
+    expect(rows(page)).to_have_count(4)
+
+    type_ground(page, ", ".join(ground_text(world, PICKED[4], height=False).split(", ")[::-1]))
+    expect(page.get_by_role("alert")).to_contain_text("longitude and latitude are exchanged")
+
+    for point in control_points(service, secret)[:2]:
+        lon, lat, _ = point["geometry"]["coordinates"]
+        field = page.get_by_label("Go to")
+        field.fill(f"{lat}, {lon}")
+        field.press("Enter")
+        until_drawn(page)
+        page.locator("#map canvas").click()
+        expect(page.get_by_alt_text(f"Chip of control point {point['id']}")).to_be_visible()
+        ground = np.array([point["geometry"]["coordinates"]])
+        choose_in_image(page, image, world.true_model.project(ground)[0])
+        until_adjusted(page)
+    page.screenshot(path=ARTEFACTS / "marks-control-points.png")
+
+    for place in PICKED[5:8]:
+        tab_to(page, "Place on the ground")
+        page.keyboard.type(ground_text(world, place))
+        page.keyboard.press("Enter")
+        expect(image).to_be_focused()
+        choose_with_keys(page, place)
+        until_adjusted(page)
+    tab_to(page, "Go to where the next mark helps most")
+    page.keyboard.press("Enter")
+    expect(image).to_be_focused()
+    page.keyboard.press("Enter")
+    expect(page.locator("#map canvas")).to_be_focused()
+    expect(page.locator(".prompt")).to_contain_text("expected in the circle")
+    page.keyboard.press("Shift+ArrowLeft")
+    page.screenshot(path=ARTEFACTS / "marks-keys-on-map.png")
+    page.keyboard.press("Enter")
+    ground_field = page.get_by_label("Place on the ground")
+    expect(ground_field).to_be_focused()
+    expect(page.locator(".prompt")).to_contain_text("The height is missing")
+    page.keyboard.type(f", {GROUND_H}")
+    page.keyboard.press("Enter")
+    expect(ground_field).to_have_value("")
+    until_adjusted(page)
+    expect(rows(page)).to_have_count(10)
+    assert np.abs(residuals_shown(page)).max() < a_pixel
+    expect(rows(page).get_by_text("used", exact=True)).to_have_count(10)
+    assert_readable(page, "marks-ten")
+    page.set_viewport_size(WIDE)
+    page.emulate_media(color_scheme="light")
+
+    before = residuals_shown(page)
+    type_ground(page, ground_text(world, PICKED[5]))
+    choose_in_image(page, image, PICKED[5] + [0.0, a_blunder_px])
+    expect(rows(page).last).to_contain_text("rejected")
+    expect(page.get_by_text(re.compile("Mark M11 is not used"))).to_be_visible()
+    assert_readable(page, "marks-blunder")
+    page.set_viewport_size(WIDE)
+    page.emulate_media(color_scheme="light")
+    image.focus()
+    page.keyboard.press("Control+z")
+    page.keyboard.press("Control+z")
+    expect(rows(page)).to_have_count(10)
+    until_adjusted(page)
+    np.testing.assert_array_equal(residuals_shown(page), before)
+
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Save as CSV").click()
+    marks, out = tmp_path / "marks.csv", tmp_path / "out"
+    marks.write_bytes(download.value.path().read_bytes())
+    amers("scene", "register", world.tagged, "--sigma-m", "6", "--control", marks, "-o", out)
+    assert_same_residuals(json.loads((out / "report.json").read_text()), before)
+
+    for _ in range(10):
+        page.get_by_role("button", name="Remove M").first.click()
+    expect(rows(page)).to_have_count(0)
+    page.get_by_label("Open marks").set_input_files(marks)
+    expect(rows(page)).to_have_count(10)
+    until_adjusted(page)
+    np.testing.assert_array_equal(residuals_shown(page), before)
+
+    page.get_by_role("button", name="Register with these marks").click()
+    expect(page.get_by_role("link", name="Open the report")).to_be_visible()
+    job = page.url.rsplit("/", 1)[1]
+    headers = {"Authorization": f"Bearer {secret}"}
+    results = httpx.get(f"{service.url}/jobs/{job}/results", headers=headers).json()
+    report = httpx.get(results["report.json"]["href"], headers=headers).json()
+    assert_same_residuals(report, before)
+
+
+def assert_same_residuals(report: dict, shown: Array) -> None:
+    found = np.array([mark["residual_px"] for mark in report["marks"]["marks"]])
+    np.testing.assert_allclose(found, shown, atol=a_hundredth_px)
+
+
+def control_points(service: Service, secret: str) -> list[dict]:
+    headers = {"Authorization": f"Bearer {secret}"}
+    found = httpx.get(f"{service.url}/collections/points/items?limit=5", headers=headers)
+    features: list[dict] = found.json()["features"]
+    return features

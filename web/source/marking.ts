@@ -1,0 +1,477 @@
+// Marking ground points in a raw image: the image and the map side by side, residuals after each mark, the file, the registration.
+
+import type { Feature, Position } from "geojson";
+import { register } from "./again";
+import { blobUrl, call, get } from "./api";
+import type { AdjustedMark, AdjustedMarks, PlaceOfMarks, PointWithViews, ResultFile, Scene, StatusInfo } from "./api_types";
+import { fill, h, plural, problem } from "./elements";
+import { type Begun, History, type InImage, type Mark, nothingBegun, type OnGround, parseInImage, parseOnGround, readCsv, type State, unlike, writeCsv } from "./marks";
+import { notesOn, StatedFields, verdictOn } from "./marks_accuracy";
+import { MarksTable } from "./marks_table";
+import { announce, go } from "./page";
+import { run, stateText } from "./processes";
+import type { Pixel } from "./shapes";
+import { tilesOf } from "./tiles";
+import { uploadBeside } from "./upload";
+import type { Place, ShowView } from "./view";
+import { type Expected, type Marked, Viewer } from "./viewer";
+
+const FILE = "marks.csv";
+const OF_IMAGE = "Raw image. Arrow keys move the crosshair, with Shift by a pixel, Enter sets the mark there, plus and minus magnify.";
+const OF_MAP = "Map. Arrow keys move it below the crosshair in its middle, with Shift by a pixel, Enter sets the mark there, plus and minus zoom.";
+/** Metres of a pixel of the map at zoom 0 on the equator: the circumference of the Earth over a tile of 512 px. */
+const ZOOM_0_M = 40_075_017 / 512;
+const LARGEST_ZOOM = 20;
+/** From the corner of a pixel, where the viewer counts from, to its centre. */
+const CENTRE = 0.5;
+/** Radius within which nine of ten places lie, in standard deviations of each coordinate. */
+const CE90_SIGMAS = 2.146;
+/** The part of the image around a place that is gone to, pixels. */
+const AROUND_PX = 60;
+
+/** A model that a job has read: its job, and whether places need heights. */
+interface ReadModel {
+  job: string;
+  needsHeights: boolean;
+}
+
+/** Shows the raw image of a scene beside the map, to mark points in both; the argument is the scene. */
+export const showMarking: ShowView = async (place, id) => {
+  const { panel, atlas, signal } = place;
+  const scene = await get<Scene>(`scenes/${encodeURIComponent(id)}`, signal);
+  const state = h("p", { class: "quiet", role: "status" }, "Opening the image …");
+  fill(panel, h("p", {}, h("a", { href: `#/scene/${scene.id}` }, "← Scene")), h("h1", { tabindex: -1 }, `Mark points in ${scene.name}`), state);
+  const report = (job: StatusInfo): string => (state.textContent = stateText(job));
+  // One after the other: a worker that reads the model first refuses a scene without one at once.
+  const model = await readModel(scene, signal, report);
+  const tiles = await tilesOf(scene.id, signal, report);
+  const section = h("section", { id: "raw-image", "aria-label": "Raw image" });
+  const map = document.getElementById("map")!;
+  panel.before(section, map);
+  document.body.classList.add("marking");
+  signal.addEventListener("abort", () => {
+    section.remove();
+    panel.after(map);
+    document.body.classList.remove("marking");
+    for (const layer of ["marks", "target", "scenes"] as const) void atlas.show(layer, []);
+  });
+  const marking = new Marking(place, scene, model, (finished) => new Viewer(section, tiles, finished, signal, OF_IMAGE));
+  await marking.open(state, tiles.index);
+};
+
+/** The delivered model of a scene, read anew: its files may have been replaced. */
+async function readModel({ id }: Scene, signal: AbortSignal, report: (job: StatusInfo) => void): Promise<ReadModel> {
+  const { jobID: job } = await run("read-model", { scene: id }, signal, report);
+  const results = await get<Record<string, ResultFile>>(`jobs/${job}/results`, signal);
+  const document = await get<object>(results["scene_model.json"]!.href, signal);
+  return { job, needsHeights: "rpc" in document };
+}
+
+/** The panel of marks, and what the image and the map show of them. */
+class Marking {
+  private readonly viewer: Viewer;
+  private readonly history: History;
+  private readonly key: string;
+  private results = new Map<string, AdjustedMark>();
+  private terrain: string | null = null;
+  private next: PlaceOfMarks | null = null;
+  private request = new AbortController();
+  private outline: Position[] = [];
+  /** Zoom of the map at which its pixels are as large as those of the image. */
+  private zoom = 15;
+
+  private readonly heading = h("h2");
+  private readonly prompt = h("p", { class: "prompt", role: "status" });
+  private readonly image = h("input", { id: "in-image", autocomplete: "off", spellcheck: false, placeholder: "1204.5, 3310" });
+  private readonly ground = h("input", { id: "on-ground", autocomplete: "off", spellcheck: false, placeholder: "5.25331, 43.25242, 120" });
+  private readonly chip = h("div", { class: "chip" });
+  private readonly mistake = h("div");
+  private readonly undo = h("button", { type: "button", onclick: () => this.back() }, "Undo");
+  private readonly redo = h("button", { type: "button", onclick: () => this.forth() }, "Redo");
+  private readonly save = h("button", { type: "button", onclick: () => this.download() }, "Save as CSV");
+  private readonly file = h("input", { type: "file", id: "open-marks", accept: ".csv", onchange: () => void this.openFile() });
+  private readonly send = h("button", { type: "button", class: "strong", onclick: () => void this.register() }, "Register with these marks");
+  private readonly onward = h("button", { type: "button", onclick: () => this.goOn() }, "Go to where the next mark helps most");
+  private readonly summary = h("div", { class: "summary", role: "status" });
+  private readonly notes = h("div");
+  private readonly stated = new StatedFields(() => void this.adjust());
+  private readonly table = new MarksTable({
+    rename: (mark, name) => this.replace(mark, { ...mark, name: unlike(name, this.marks.filter((one) => one !== mark)) }),
+    check: (mark, check) => this.replace(mark, { ...mark, check }),
+    show: (mark) => this.look(mark),
+    change: (mark) => this.change(mark),
+    remove: (mark) => this.put({ marks: this.marks.filter((one) => one !== mark), begun: this.begun }, `${mark.name} removed.`),
+  });
+
+  constructor(
+    private readonly place: Place,
+    private readonly scene: Scene,
+    private readonly model: ReadModel,
+    viewer: (finished: (kind: string, vertices: Pixel[]) => void) => Viewer,
+  ) {
+    this.key = `amers-marks ${scene.id}`;
+    const kept = JSON.parse(sessionStorage.getItem(this.key) ?? "null") as State | null;
+    this.history = new History(kept ?? { marks: [], begun: nothingBegun([]) });
+    this.viewer = viewer((_, [at]) => this.choose({ image: { sample: at![0] - CENTRE, line: at![1] - CENTRE } }));
+  }
+
+  private get marks(): Mark[] {
+    return this.history.now.marks;
+  }
+
+  private get begun(): Begun {
+    return this.history.now.begun;
+  }
+
+  /** Fill the panel below its heading, in the place of an element, and begin. */
+  async open(instead: HTMLElement, { lines, samples }: { lines: number; samples: number }): Promise<void> {
+    const { panel, atlas, signal } = this.place;
+    const tools = h("div", { class: "tools", role: "group", "aria-label": "Marks" }, this.undo, this.redo, this.save, this.send);
+    instead.replaceWith(h("div", { class: "marking-panel" }, h("div", {}, this.form(), this.chip, this.mistake), h("div", {}, h("div", { class: "marking-head" }, tools, this.summary), this.table.element, this.onward, this.notes, this.stated.element, this.fileField())));
+    panel.ownerDocument.addEventListener("keydown", (event) => this.shortcut(event), { signal });
+    atlas.pick((position, point) => void this.chooseOnMap(position, point), signal);
+    atlas.aim(OF_MAP, signal);
+    const corners = [[0, 0], [0, samples - 1], [lines - 1, samples - 1], [lines - 1, 0]].map(([line, sample]) => ({ line, sample }));
+    const { places } = await this.ask(corners);
+    this.outline = places.filter(({ lon }) => lon != null).map(({ lon, lat }) => [lon!, lat!]);
+    const [[lon, lat] = [NaN, NaN], [otherLon, otherLat] = [NaN, NaN]] = this.outline as [number, number][];
+    const side_deg = Math.hypot((otherLon! - lon!) * Math.cos(radians(lat!)), otherLat! - lat!);
+    if (side_deg > 0) this.zoom = zoomOf(side_deg / samples, lat!);
+    const geometry = { type: "Polygon" as const, coordinates: [[...this.outline, ...this.outline.slice(0, 1)]] };
+    await atlas.show("scenes", [{ type: "Feature", geometry, properties: { id: this.scene.id, name: this.scene.name } }]);
+    atlas.fit(geometry);
+    this.refresh();
+    await this.adjust();
+  }
+
+  private form(): HTMLElement {
+    return h(
+      "form",
+      { onsubmit: (event) => this.submit(event) },
+      this.heading,
+      this.prompt,
+      h("label", { for: "in-image" }, "Place in the image", h("span", { class: "quiet" }, " line, sample")),
+      this.image,
+      h("label", { for: "on-ground" }, "Place on the ground", h("span", { class: "quiet" }, " longitude, latitude, height above the ellipsoid")),
+      this.ground,
+      h("div", { class: "tools" }, h("button", { type: "submit" }, "Set"), h("button", { type: "button", onclick: () => this.put({ marks: this.marks, begun: nothingBegun(this.marks) }, "Given up.") }, "Give up")),
+    );
+  }
+
+  private fileField(): HTMLElement {
+    return h("div", { class: "open-file" }, h("label", { for: "open-marks" }, "Open marks", h("span", { class: "quiet" }, " a CSV that was saved here")), this.file);
+  }
+
+  private shortcut(event: KeyboardEvent): void {
+    if (!(event.ctrlKey || event.metaKey) || event.target instanceof HTMLInputElement) return;
+    const key = event.key.toLowerCase();
+    if (key === "z" && !event.shiftKey) this.back();
+    else if (key === "y" || key === "z") this.forth();
+    else return;
+    event.preventDefault();
+  }
+
+  private back(): void {
+    this.history.undo();
+    this.changed("Undone.");
+  }
+
+  private forth(): void {
+    this.history.redo();
+    this.changed("Done again.");
+  }
+
+  private put(state: State, words: string): void {
+    this.history.add(state);
+    this.changed(words);
+  }
+
+  private replace(mark: Mark, by: Mark): void {
+    this.put({ marks: this.marks.map((one) => (one === mark ? by : one)), begun: this.begun }, `${by.name} changed.`);
+  }
+
+  private changed(words: string): void {
+    announce(words);
+    fill(this.mistake);
+    this.refresh();
+    void this.adjust();
+  }
+
+  /** The place on the map, or the control point there with its height and sigmas. */
+  private async chooseOnMap([lon, lat]: Position, point?: number): Promise<void> {
+    try {
+      this.choose({ ground: point === undefined ? { lon: lon!, lat: lat!, height_m: null, sigma_m: null } : await pointOnGround(point, this.place.signal) });
+    } catch (error) {
+      this.refuse(error);
+    }
+  }
+
+  /** Take a half of a mark, or both; a mark with both and a height is complete. */
+  private choose(half: { image?: InImage; ground?: OnGround }): void {
+    const begun: Begun = { ...this.begun, ...half };
+    const { image, ground, name, check } = begun;
+    if (image && ground && !this.lacksHeight(ground)) {
+      const mark = { ...ground, ...image, name, check };
+      const marks = [...this.marks, mark];
+      this.put({ marks, begun: nothingBegun(marks) }, `${name} set.`);
+      return;
+    }
+    this.put({ marks: this.marks, begun }, image ? "Place in the image chosen." : "Place on the ground chosen.");
+    if (image && ground) {
+      this.ground.focus();
+      this.ground.setSelectionRange(this.ground.value.length, this.ground.value.length);
+    } else if (image) document.querySelector<HTMLElement>("#map canvas")?.focus({ preventScroll: true });
+    else this.viewer.element.focus({ preventScroll: true });
+  }
+
+  private lacksHeight({ height_m }: OnGround): boolean {
+    return height_m == null && this.terrain == null && this.model.needsHeights;
+  }
+
+  private submit(event: Event): void {
+    event.preventDefault();
+    try {
+      const half: { image?: InImage; ground?: OnGround } = {};
+      const { image, ground } = this.begun;
+      if (this.image.value.trim() && this.image.value !== imageText(image)) half.image = parseInImage(this.image.value);
+      if (this.ground.value.trim() && this.ground.value !== groundText(ground)) half.ground = this.inside(parseOnGround(this.ground.value));
+      if (!half.image && !half.ground) throw new Error(image && ground ? "A height is missing: add it after longitude and latitude." : "A place in the image or on the ground is missing.");
+      this.choose(half);
+      if (half.ground) void this.place.atlas.goTo([half.ground.lon, half.ground.lat], this.zoom);
+    } catch (error) {
+      this.refuse(error);
+    }
+  }
+
+  /** A typed place, unless it lies in the scene with longitude and latitude exchanged alone. */
+  private inside(ground: OnGround): OnGround {
+    const within = (lon: number, lat: number): boolean => {
+      const [lons, lats] = [this.outline.map((place) => place[0]!), this.outline.map((place) => place[1]!)];
+      const margin = 1;
+      return lon > Math.min(...lons) - margin && lon < Math.max(...lons) + margin && lat > Math.min(...lats) - margin && lat < Math.max(...lats) + margin;
+    };
+    if (this.outline.length && !within(ground.lon, ground.lat) && within(ground.lat, ground.lon)) {
+      throw new Error("Place on the ground: longitude and latitude are exchanged; longitude comes first.");
+    }
+    return ground;
+  }
+
+  private refuse(error: unknown): void {
+    if (!this.place.signal.aborted) fill(this.mistake, problem(error));
+  }
+
+  /** Put the halves of a mark back to where they are chosen: the next choice replaces one of them. */
+  private change(mark: Mark): void {
+    const { name, check, line, sample, ...ground } = mark;
+    const begun: Begun = { name, check, image: { line, sample }, ground };
+    this.put({ marks: this.marks.filter((one) => one !== mark), begun }, `${name}: choose its place in the image or on the ground again.`);
+    this.look(mark);
+    this.image.focus();
+  }
+
+  /** Bring a mark into the middle of the image and of the map. */
+  private look({ line, sample, lon, lat }: Mark): void {
+    this.viewer.goTo({ at: pixel({ line, sample }), radius: AROUND_PX });
+    void this.place.atlas.goTo([lon, lat], this.zoom);
+  }
+
+  private goOn(): void {
+    if (this.next?.line == null || this.next.sample == null) return;
+    this.viewer.goTo({ at: pixel({ line: this.next.line, sample: this.next.sample }), radius: AROUND_PX });
+    if (this.next.lon != null) void this.place.atlas.goTo([this.next.lon, this.next.lat!], this.zoom);
+    this.viewer.element.focus();
+  }
+
+  /** Show the marks, and the half that is chosen, everywhere. */
+  private refresh(): void {
+    const { marks, begun } = this;
+    sessionStorage.setItem(this.key, JSON.stringify(this.history.now));
+    this.undo.disabled = !this.history.canUndo;
+    this.redo.disabled = !this.history.canRedo;
+    this.save.disabled = this.send.disabled = marks.length === 0;
+    this.heading.textContent = `Mark ${begun.name}`;
+    this.image.value = imageText(begun.image);
+    this.ground.value = groundText(begun.ground);
+    this.prompt.textContent = this.promptText();
+    this.table.show(marks, this.results);
+    this.drawMarks();
+    void this.drawChip(begun.ground?.point);
+  }
+
+  private promptText(): string {
+    const { image, ground } = this.begun;
+    if (image && ground && this.lacksHeight(ground)) return "The height is missing: add it after longitude and latitude, in metres above the ellipsoid, then Set.";
+    if (image && ground) return "Choose its place in the image or on the map again.";
+    if (image) return "Now the same place on the map.";
+    if (ground) return "Now the same place in the image.";
+    return "Choose a place in the image or on the map.";
+  }
+
+  private drawMarks(): void {
+    const { marks, begun } = this;
+    const marked = marks.map((mark): Marked => {
+      const found = this.results.get(mark.name);
+      const [line, sample] = found?.residual_px ?? [];
+      const computed = line == null || sample == null ? null : pixel({ line: mark.line - line, sample: mark.sample - sample });
+      return { name: mark.name, at: pixel(mark), computed, colour: found?.status === "rejected" ? "rejected" : mark.check ? "ofMap" : "drawn" };
+    });
+    if (begun.image) marked.push({ name: begun.name, at: pixel(begun.image), computed: null, colour: "begun" });
+    this.viewer.show({ marked, expected: null });
+    const features = marks.map((mark): Feature => {
+      const colour = this.results.get(mark.name)?.status === "rejected" ? "rejected" : mark.check ? "check" : "used";
+      return feature(mark, { name: mark.name, colour });
+    });
+    if (begun.ground) features.push(feature(begun.ground, { name: begun.name, colour: "begun" }));
+    void this.place.atlas.show("marks", features);
+    if (!begun.image) void this.place.atlas.show("target", []);
+  }
+
+  /** The chip of a control point, as a help to find the same place in the image. */
+  private async drawChip(point: number | undefined): Promise<void> {
+    if (this.chip.dataset["point"] === String(point)) return;
+    this.chip.dataset["point"] = String(point);
+    fill(this.chip);
+    if (point === undefined) return;
+    const { signal } = this.place;
+    try {
+      const src = await blobUrl(`collections/points/items/${point}/chips/0?f=png`, signal);
+      if (this.chip.dataset["point"] !== String(point)) return;
+      fill(this.chip, h("figure", {}, h("img", { src, alt: `Chip of control point ${point}`, width: 101, height: 101 }), h("figcaption", {}, `Control point ${point}: the place is the middle of its chip, north is up.`)));
+    } catch (error) {
+      if (!signal.aborted && this.chip.dataset["point"] === String(point)) fill(this.chip, problem(error));
+    }
+  }
+
+  /** Let the service adjust the model on the marks; only the last of several requests counts. */
+  private async adjust(): Promise<void> {
+    const { image, ground } = this.begun;
+    const asked = image && !ground ? [image] : ground && !image ? [{ lon: ground.lon, lat: ground.lat, height_m: ground.height_m }] : [];
+    this.request.abort();
+    const request = (this.request = new AbortController());
+    this.summary.setAttribute("aria-busy", "true");
+    try {
+      const reply = await this.ask(asked, AbortSignal.any([request.signal, this.place.signal]));
+      if (request.signal.aborted) return;
+      this.results = new Map(reply.marks.map((mark) => [mark.name, mark]));
+      this.next = reply.next_mark;
+      this.table.show(this.marks, this.results);
+      this.drawMarks();
+      fill(this.summary, verdictOn(reply));
+      fill(this.notes, ...notesOn(reply, this.model.needsHeights));
+      this.onward.hidden = this.next?.line == null;
+      if (reply.places[0]) this.expect(reply.places[0]);
+    } catch (error) {
+      if (request.signal.aborted || this.place.signal.aborted) return;
+      this.results = new Map();
+      this.table.show(this.marks, this.results);
+      fill(this.summary, problem(error));
+      fill(this.notes);
+    }
+    this.summary.setAttribute("aria-busy", "false");
+  }
+
+  private async ask(places: object[], signal: AbortSignal = this.place.signal): Promise<AdjustedMarks> {
+    const marks = this.marks.map(({ point: _, ...mark }) => mark);
+    const body = JSON.stringify({ marks, places, ...this.stated.value });
+    const reply = await call(`jobs/${this.model.job}/marks`, { method: "POST", body, headers: { "Content-Type": "application/json" }, signal });
+    const adjusted = (await reply.json()) as AdjustedMarks;
+    this.terrain = adjusted.terrain;
+    return adjusted;
+  }
+
+  /** Show where the other half of a mark is expected. */
+  private expect({ line, sample, lon, lat, sigma_px: sigma }: PlaceOfMarks): void {
+    const { atlas } = this.place;
+    if (this.begun.image) {
+      if (lon == null || lat == null) return;
+      void atlas.goTo([lon, lat], this.zoom);
+      this.prompt.textContent = "Now the same place on the map: it is expected in the circle in its middle.";
+      return;
+    }
+    if (line == null || sample == null) {
+      this.prompt.textContent = "The image does not show this place.";
+      return;
+    }
+    const radius = CE90_SIGMAS * (sigma ?? AROUND_PX);
+    const expected: Expected = { at: pixel({ line, sample }), radius };
+    this.viewer.show({ expected });
+    this.viewer.goTo({ ...expected, radius: Math.max(radius, AROUND_PX) });
+    this.prompt.textContent = `Now the same place in the image: it is expected in the circle of ${Math.max(radius, 1).toFixed(0)} px, at line ${line.toFixed(0)}, sample ${sample.toFixed(0)}.`;
+  }
+
+  private csv(): File {
+    return new File([writeCsv(this.marks, this.results, this.stated.value)], FILE, { type: "text/csv" });
+  }
+
+  private download(): void {
+    const href = URL.createObjectURL(this.csv());
+    h("a", { href, download: FILE }).click();
+    setTimeout(() => URL.revokeObjectURL(href), 10_000);
+    announce(`${FILE} saved.`);
+  }
+
+  private async openFile(): Promise<void> {
+    const [file] = this.file.files ?? [];
+    if (!file) return;
+    try {
+      const marks = readCsv(await file.text());
+      this.put({ marks, begun: nothingBegun(marks) }, `${plural(marks.length, "mark")} opened.`);
+    } catch (error) {
+      this.refuse(error);
+    }
+    this.file.value = "";
+  }
+
+  private async register(): Promise<void> {
+    this.send.disabled = true;
+    try {
+      const control = await uploadBeside(this.scene.id, this.csv());
+      const { frame_sigma_m: frame } = this.stated.value;
+      const inputs = { method: "marks", control, ...(frame ? { control_frame_sigma_m: frame } : {}) };
+      go(`#/job/${await register(this.scene.id, inputs)}`);
+    } catch (error) {
+      this.refuse(error);
+      this.send.disabled = false;
+    }
+  }
+}
+
+/** The ground of a control point, with its sigmas. */
+async function pointOnGround(point: number, signal: AbortSignal): Promise<OnGround> {
+  const { geometry, properties } = await get<PointWithViews>(`collections/points/items/${point}`, signal);
+  const [lon, lat, height_m] = geometry.coordinates as [number, number, number];
+  const { sigma_east_m: east, sigma_north_m: north, sigma_up_m: up } = properties;
+  return { lon, lat, height_m, sigma_m: [Math.max(east!, north!), up!], point };
+}
+
+/** Zoom at which a pixel of the map is as large as one of so many degrees of a great circle at a latitude. */
+function zoomOf(step_deg: number, lat: number): number {
+  const step_m = (step_deg * 40_075_017) / 360;
+  return Math.min(Math.log2((ZOOM_0_M * Math.cos(radians(lat))) / step_m), LARGEST_ZOOM);
+}
+
+function radians(degrees: number): number {
+  return (degrees * Math.PI) / 180;
+}
+
+function pixel({ line, sample }: InImage): Pixel {
+  return [sample + CENTRE, line + CENTRE];
+}
+
+function feature({ lon, lat }: OnGround, properties: object): Feature {
+  return { type: "Feature", properties: { ...properties }, geometry: { type: "Point", coordinates: [lon, lat] } };
+}
+
+function imageText(image: InImage | null): string {
+  return image ? `${round(image.line, 3)}, ${round(image.sample, 3)}` : "";
+}
+
+function groundText(ground: OnGround | null): string {
+  if (!ground) return "";
+  const height = ground.height_m == null ? "" : `, ${round(ground.height_m, 3)}`;
+  return `${round(ground.lon, 8)}, ${round(ground.lat, 8)}${height}`;
+}
+
+function round(value: number, decimals: number): number {
+  return Number(value.toFixed(decimals));
+}
