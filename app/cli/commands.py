@@ -74,6 +74,10 @@ COMMANDS: Tree = {
                 "Measure errors of marked points by the number of control points, the images and their "
                 "base.",
             ),
+            "reach": Command(
+                "site_reach:reach",
+                "Measure how far each of several known sites carries alone.",
+            ),
             "query": Command(
                 "point_query:query",
                 "Write all points of a box; --json without --output prints only their number.",

@@ -43,6 +43,7 @@ class ImageOptions:
         since: leave out images of --catalogue before this day.
         selection: folder that `amers production select` has written.
         sigma_m: accuracy of the models, one sigma, metres.
+        ortho_sigma_m: the same of those that are ortho-images; by default --sigma-m.
     """
 
     images: tuple[str, ...] = ()
@@ -51,6 +52,7 @@ class ImageOptions:
     since: Annotated[datetime | None, typer.Option(formats=["%Y-%m-%d"])] = None
     selection: Path | None = None
     sigma_m: FromCenti = None
+    ortho_sigma_m: FromCenti = None
 
     def check(self) -> None:
         """Refuse images of two places, of none, or that are missing.
@@ -138,6 +140,7 @@ def run(
                 tuple(map(file_place, images.images)),
                 selection,
                 images.sigma_m,
+                images.ortho_sigma_m,
                 control_files,
                 ground,
                 models,

@@ -15,7 +15,7 @@ from amers.services.production.image_production import ProductionOptions
 from amers.services.quality.control_series import MarkedGroundPoints, SeriesRow, control_series
 from amers.services.sensors.pushbroom import PushbroomModel
 from amers.services.statements import Statements
-from amers.services.types import Progress, no_progress
+from amers.services.types import Array, BoolArray, Progress, no_progress
 
 COUNTS = (0, 1, 2, 3, 4, 6, 8, 10, 15, 20)
 """Numbers of control points that are tried by default, as far as the points allow."""
@@ -130,40 +130,60 @@ def _wrong_points(read: ImageMarks) -> set[int]:
 def _points(
     read: ImageMarks, point_sigma_m: tuple[float, float] | None, wrong: set[int]
 ) -> MarkedGroundPoints:
-    known, sigma_m = read.known.copy(), read.sigma_m
+    known = read.known.copy()
     left_out = np.isin(np.arange(len(known)), sorted(wrong))
     known[left_out] = np.nan
-    if point_sigma_m is not None:
-        horizontal_m, up_m = point_sigma_m
-        sigma_m = np.where(np.isnan(sigma_m), [horizontal_m, horizontal_m, up_m], sigma_m)
-    unstated = np.isfinite(known).all(axis=1) & np.isnan(sigma_m).any(axis=1)
-    if unstated.any():
-        raise InputError(
-            f"{int(unstated.sum())} points, such as {read.names[int(np.argmax(unstated))]}, have no "
-            "sigma of their ground: state it (--point-sigma-m HORIZONTAL,UP)"
-        )
+    sigma_m = with_stated_sigmas(read, np.asarray(np.isfinite(known).all(axis=1)), point_sigma_m)
     return MarkedGroundPoints(
         names=read.names,
         known=known,
         sigma_m=sigma_m,
         marks=read.marks.take(~left_out[read.marks.point]),
-        images=tuple(_adjustable(scene) for scene in read.scenes),
+        images=tuple(adjustable(scene) for scene in read.scenes),
         models=tuple(scene.model for scene in read.scenes),
         gsd_m=np.array([scene_gsd_m(scene) for scene in read.scenes]),
     )
 
 
-def _adjustable(scene: Scene) -> AdjustableImage:
-    """What may move in an image: its orbit and attitude, or a correction in the image."""
+def with_stated_sigmas(
+    read: ImageMarks, known: BoolArray, point_sigma_m: tuple[float, float] | None
+) -> Array:
+    """The sigmas (n, 3) of known ground, those that no file states from the caller.
+
+    Raises:
+        InputError: a point of known ground (n,) has none.
+    """
+    sigma_m = read.sigma_m
+    if point_sigma_m is not None:
+        horizontal_m, up_m = point_sigma_m
+        sigma_m = np.where(np.isnan(sigma_m), [horizontal_m, horizontal_m, up_m], sigma_m)
+    unstated = known & np.isnan(sigma_m).any(axis=1)
+    if unstated.any():
+        raise InputError(
+            f"{int(unstated.sum())} points, such as {read.names[int(np.argmax(unstated))]}, have no "
+            "sigma of their ground: state it (--point-sigma-m HORIZONTAL,UP)"
+        )
+    return sigma_m
+
+
+def adjustable(scene: Scene, edge_sigma_m: float | None = None) -> AdjustableImage:
+    """What may move in an image: its orbit and attitude, or a correction in the image.
+
+    Args:
+        scene: the image.
+        edge_sigma_m: a priori sigma of drifts and skews at its edge; by default that of a production.
+    """
     name = scene.acquisition.image_id
     if scene.parameter_set is not None and isinstance(scene.model, PushbroomModel):
         return rigorous_parameters(name, scene.model, scene.parameter_set, sigma_m=scene.sigma_m)
+    gsd_m = scene_gsd_m(scene)
+    slope_px = ProductionOptions().slope * max(scene.image.shape) / 2.0
     return image_parameters(
         name,
         scene.model,
         scene.image.shape,
-        shift_px=scene.sigma_m / scene_gsd_m(scene),
-        slope_px=ProductionOptions().slope * max(scene.image.shape) / 2.0,
+        shift_px=scene.sigma_m / gsd_m,
+        slope_px=slope_px if edge_sigma_m is None else edge_sigma_m / gsd_m,
     )
 
 

@@ -50,6 +50,7 @@ class ProductionImages:
         files: images with their models beside them or inside.
         selection: folder that `run_selection` has written; its images are added.
         sigma_m: accuracy of the images' models, metres; by default that of the producer or the sensor.
+        ortho_sigma_m: the same of those that are ortho-images; by default `sigma_m`.
         control: places the block on the Earth.
         ground: where no points are wanted, and what points stand on.
         models: of the files whose names and tags do not give them.
@@ -58,6 +59,7 @@ class ProductionImages:
     files: tuple[FilePlace, ...] = ()
     selection: Path | None = None
     sigma_m: float | None = None
+    ortho_sigma_m: float | None = None
     control: ControlFiles = field(default_factory=ControlFiles)
     ground: GroundFiles = field(default_factory=GroundFiles)
     models: ModelChoice = field(default_factory=ModelChoice)
@@ -165,10 +167,11 @@ def _read(
         stack.callback(scene.image.close)  # type: ignore[attr-defined]
         scenes.append(scene)
 
+    sigma_m, ortho_sigma_m = images.sigma_m, images.ortho_sigma_m
     chosen_models = images.models.of([path for path in images.files if isinstance(path, Path)])
     for path in images.files:
         model, origin = chosen_models[path] if isinstance(path, Path) else (None, None)
-        add(read_scene(path, model, sigma_m=images.sigma_m, crop_origin=origin))
+        add(read_scene(path, model, sigma_m=sigma_m, ortho_sigma_m=ortho_sigma_m, crop_origin=origin))
     if images.selection is not None:
         source = images.selection / ITEMS
         chosen = read_catalogue(str(source), elsewhere=True)
@@ -179,7 +182,11 @@ def _read(
         masks = chosen.images.mask.tolist()
         for row, item in enumerate(chosen.items.read(range(len(masks)))):
             progress(row / len(masks), f"reading {len(masks)} images")
-            add(read_item_scene(item, str(source), masks[row], sigma_m=images.sigma_m))
+            add(
+                read_item_scene(
+                    item, str(source), masks[row], sigma_m=sigma_m, ortho_sigma_m=ortho_sigma_m
+                )
+            )
             files.append(image_place(item, str(source)))
     return scenes, files
 

@@ -69,6 +69,7 @@ class ImageMarks:
         known: (n, 3) where the files state their ground; NaN elsewhere.
         sigma_m: (n, 3) of the known ground; NaN when unknown.
         check: (n,) points that the files flag as check points.
+        file: (n,) number of the first file that states its ground; -1 without.
         marks: in the images.
         scenes: the images.
         errors: of their models.
@@ -81,6 +82,7 @@ class ImageMarks:
     known: Array
     sigma_m: Array
     check: BoolArray
+    file: IntArray
     marks: Observations
     scenes: tuple[Scene, ...]
     errors: tuple[ModelErrors, ...]
@@ -148,26 +150,29 @@ def _scene(
     if files.block is not None:
         return read_scene(image, adjusted_model(files.block, image), sigma_m=1.0), None
     rigorous = None if files.rigorous is None else parameter_set_named(files.rigorous)
-    sigma_m = _sigmas_m(files).get(image)
+    sigma_m = metres_by_image("--sigma-m", files.sigma_m, files.images).get(image)
     scene = read_scene(image, model, sigma_m=sigma_m, crop_origin=origin, parameter_set=rigorous)
     return scene, None
 
 
-def _sigmas_m(files: MarkedImages) -> dict[Path, float]:
-    """The accuracies that are stated of the models of images; one value alone is that of every image."""
-    if len(files.sigma_m) == 1 and "=" not in files.sigma_m[0]:
-        return dict.fromkeys(files.images, _metres(files.sigma_m[0]))
-    stated = by_image("--sigma-m", files.sigma_m, files.images)
-    return {image: _metres(text) for image, text in stated.items()}
+def metres_by_image(option: str, values: Sequence[str], images: Sequence[Path]) -> dict[Path, float]:
+    """Lengths that are stated of images: of one each, IMAGE=M, or one value alone of every image.
+
+    Raises:
+        InputError: a value is no length above 0, or of no image.
+    """
+    if len(values) == 1 and "=" not in values[0]:
+        return dict.fromkeys(images, _metres(option, values[0]))
+    return {image: _metres(option, text) for image, text in by_image(option, values, images).items()}
 
 
-def _metres(text: str) -> float:
+def _metres(option: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = float("nan")
     if not 0.0 < value < 1e6:
-        raise InputError(f"--sigma-m: {text[:60]!r} found, metres above 0 expected, such as 5")
+        raise InputError(f"{option}: {text[:60]!r} found, metres above 0 expected, such as 5")
     return value
 
 
@@ -177,6 +182,7 @@ class _Points:
     known: Array
     sigma_m: Array
     check: BoolArray
+    file: IntArray
     marks: Observations
     statements: Statements
 
@@ -196,22 +202,24 @@ def _points(files: MarkedImages, scenes: Sequence[Scene]) -> _Points:
     names, point = np.unique(np.concatenate([one.id for one in read]), return_inverse=True)
     point = point.astype(np.int64)
     known, sigma_m = np.full((len(names), 3), np.nan), np.full((len(names), 3), np.nan)
-    check = np.zeros(len(names), dtype=np.bool_)
+    check, file = np.zeros(len(names), dtype=np.bool_), np.full(len(names), -1)
     rows = 0
-    for one, path in zip(read, files.marks, strict=True):
+    for number, (one, path) in enumerate(zip(read, files.marks, strict=True)):
         own = point[rows : rows + len(one)]
         rows += len(one)
         _set_ground(known, sigma_m, own, one, path)
         check[own[one.check]] = True
+        new = own[np.isfinite(one.lon_lat_h[:, 0])]
+        file[new[file[new] < 0]] = number
     marked = np.concatenate([one.is_marked for one in read])
     line_sample, sigma_px = (
         np.concatenate([getattr(one, name) for one in read])[marked]
         for name in ("line_sample", "sigma_px")
     )
-    number, image = point[marked], np.concatenate(images)
-    order = np.lexsort((image, number))
+    of_point, image = point[marked], np.concatenate(images)
+    order = np.lexsort((image, of_point))
     sigma_px = np.nan_to_num(sigma_px, nan=files.mark_sigma_px or MARKING_SIGMA_PX)
-    marks = Observations(number, image, line_sample, sigma_px).take(order)
+    marks = Observations(of_point, image, line_sample, sigma_px).take(order)
     same = (np.diff(marks.point) == 0) & (np.diff(marks.image) == 0)
     if same.any():
         row = int(np.flatnonzero(same)[0])
@@ -220,7 +228,7 @@ def _points(files: MarkedImages, scenes: Sequence[Scene]) -> _Points:
             f"{scenes[marks.image[row]].acquisition.image_id}, once expected; give points other names"
         )
     statements = tuple(chain(*(one.statements for one in read)))
-    return _Points(tuple(names.tolist()), known, sigma_m, check, marks, statements)
+    return _Points(tuple(names.tolist()), known, sigma_m, check, file, marks, statements)
 
 
 def _set_ground(known: Array, sigma_m: Array, point: IntArray, marks: MarkedPoints, path: Path) -> None:
@@ -260,6 +268,7 @@ def _with_models(
         points.known,
         points.sigma_m,
         points.check,
+        points.file,
         points.marks,
         tuple(scenes),
         tuple(errors),

@@ -120,6 +120,7 @@ def read_scene(
     model_path: Path | None = None,
     *,
     sigma_m: float | None = None,
+    ortho_sigma_m: float | None = None,
     bands: BandMix | None = None,
     crop_origin: tuple[float, float] | None = None,
     mask: Path | None = None,
@@ -135,6 +136,7 @@ def read_scene(
         sigma_m: horizontal accuracy of the model, one standard deviation of each coordinate; by default
             the figure of the producer, else that of the sensor, else 50 m. Required for an ortho-image
             of an unknown sensor. The accuracy of a datum transformation is added to it.
+        ortho_sigma_m: the same where the image is an ortho-image; by default `sigma_m`.
         bands: the bands to use; by default the panchromatic band or the mean of the visible bands.
         mask: image of the same ground, with the same or coarser pixels, nonzero where pixels are
             excluded.
@@ -156,7 +158,7 @@ def read_scene(
         if grid is not None or rigorous is not None:
             has_model = model_path is not None or crop_origin is not None or has_rpc(image, siblings)
             if grid is not None and not has_model:
-                return _ortho_scene(image, grid, sigma_m, mask)
+                return _ortho_scene(image, grid, ortho_sigma_m or sigma_m, mask)
             if rigorous is not None and not has_model:
                 file = rigorous.path
         delivered = model_of_image(image, file, crop_origin, siblings)

@@ -49,7 +49,12 @@ READER = Reader(
 
 
 def read_item_scene(
-    item: Any, source: str, hidden: shapely.Geometry | None = None, *, sigma_m: float | None = None
+    item: Any,
+    source: str,
+    hidden: shapely.Geometry | None = None,
+    *,
+    sigma_m: float | None = None,
+    ortho_sigma_m: float | None = None,
 ) -> Scene:
     """The scene of an item's image, without the ground that its masks hide.
 
@@ -59,7 +64,7 @@ def read_item_scene(
         item: JSON of a STAC item, with absolute addresses.
         source: where it stands, for messages.
         hidden: polygons of clouds and the like; None hides nothing.
-        sigma_m: accuracy of the model, see `read_scene`.
+        sigma_m, ortho_sigma_m: accuracy of the model, see `read_scene`.
 
     Raises:
         FormatError: the item has no image in a file, or the image cannot be used.
@@ -68,7 +73,8 @@ def read_item_scene(
     name = stated.key[1]
     path = image_place(item, f"{source}: item {name!r:.80}")
     try:
-        scene = without_hidden_ground(read_scene(path, sigma_m=sigma_m), hidden)
+        scene = read_scene(path, sigma_m=sigma_m, ortho_sigma_m=ortho_sigma_m)
+        scene = without_hidden_ground(scene, hidden)
     except FormatError as error:
         raise FormatError(f"image {name:.80}: {error}") from None
     acquisition = replace(

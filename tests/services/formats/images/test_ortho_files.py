@@ -99,6 +99,7 @@ def test_an_ortho_scene_of_an_unknown_sensor_needs_an_accuracy(tmp_path: Path) -
     with pytest.raises(FormatError, match="sigma_m"):
         read_scene(path)
     assert read_scene(path, sigma_m=3.0).sigma_m == 3.0
+    assert read_scene(path, sigma_m=8.0, ortho_sigma_m=3.0).sigma_m == 3.0
 
 
 def test_an_image_without_map_grid_and_model_is_refused_with_the_reason(tmp_path: Path) -> None:

@@ -269,7 +269,9 @@ def test_the_accuracy_is_the_stated_one_else_that_of_the_sensor(
 
 
 def test_the_accuracy_the_user_gives_comes_first(tmp_path: Path) -> None:
-    assert read_scene(write_image(tmp_path / "a.tif", tagged=CROP), sigma_m=12.0).sigma_m == 12.0
+    path = write_image(tmp_path / "a.tif", tagged=CROP)
+    assert read_scene(path, sigma_m=12.0).sigma_m == 12.0
+    assert read_scene(path, sigma_m=12.0, ortho_sigma_m=3.0).sigma_m == 12.0
 
 
 def refined(model: RpcModel) -> RpcModel:
