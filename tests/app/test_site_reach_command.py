@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks._cape_verde import SITES, STEREO, draw
 from benchmarks._cape_verde_files import write_files
+from benchmarks.cape_verde import PUBLISHED
 from tests.command_line import amers_here
 
 pytestmark = pytest.mark.long
@@ -27,7 +28,10 @@ def test_every_site_is_checked_by_every_other_one_within_what_is_declared(words:
     assert document["heights"] == document["ties"] > 100
     checks = document["checks"]
     assert len(checks) == 12
-    assert {round(check["distance_km"]) for check in checks} == {68, 148, 209, 224, 244, 269}
+    assert all(
+        abs(check["distance_km"] - PUBLISHED[check["known"], check["check"]][0]) < 3.0
+        for check in checks
+    )
     squares = [
         np.array(check["error_m"])[:2]
         @ np.linalg.solve(np.array(check["covariance_m2"])[:2, :2], check["error_m"][:2])
