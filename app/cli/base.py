@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from amers.app.cli.options import GeoidFile, Shown
+from amers.app.cli.options import Shown
 from amers.app.cli.output import AsJson, Row, as_size, show_one
 from amers.app.cli.production_rows import accuracy_row
 from amers.app.cli.progress import shown_progress
@@ -57,7 +57,10 @@ def make(
     vertical: Annotated[
         str | None, typer.Option(help="Vertical datum of --dem: ellipsoid, EGM96, EGM2008, EPSG:…")
     ] = None,
-    geoid: GeoidFile = None,
+    geoid: Annotated[
+        Path | None,
+        typer.Option(help="Grid of the geoid, GTX or GeoTIFF; also its name among PROJ's grids."),
+    ] = None,
     since: Annotated[
         str | None, typer.Option(help="Leave out images before this day, UTC: YYYY-MM-DD.")
     ] = None,

@@ -17,7 +17,7 @@ from amers.app.usecases.base.search import (
     chosen_dates,
     find_candidates,
     plan_base,
-    read_bounds,
+    read_area,
     read_candidates,
     spacing_m,
     write_candidates,
@@ -104,8 +104,8 @@ class _Making:
         if self.request.terrain is not None:
             terrain = read_terrain(self.request.terrain, sigma_m)
             return GroundHeights(terrain, frame_sigma_m=math.nan if up_m is None else up_m)
-        bounds = shapely.union_all([read_bounds(tile, self.archive) for tile in plan.tiles]).envelope
-        folder = read_terrain_windows(candidates, bounds, kept / "terrain")
+        area = shapely.union_all([read_area(tile, self.archive) for tile in plan.tiles])
+        folder = read_terrain_windows(candidates, area, kept / "terrain")
         stated = COPERNICUS_DEM.accuracy[0]
         file = TerrainFile(folder, "EGM2008", self.request.geoid)
         terrain = read_terrain(file, sigma_m or stated.own_m)

@@ -15,7 +15,7 @@ from amers.app.errors import InputError
 from amers.app.usecases.base.request import BaseOptions, BaseRequest, area_km2
 from amers.services.errors import FormatError
 from amers.services.formats.stac.archive_items import archive_image
-from amers.services.formats.stac.catalogue import read_catalogue
+from amers.services.formats.stac.catalogue import NoItems, read_catalogue
 from amers.services.geodesy import metres_per_degree
 from amers.services.imagery.archives import COPERNICUS_DEM, Archive, ArchiveImage
 from amers.services.production.date_choice import TileArea, choose_dates, tile_areas
@@ -111,7 +111,8 @@ def find_candidates(
             "--catalogue: nothing found; a folder, a file or the address of a search API expected. "
             "docs/methods/base.md lists public ones"
         )
-    box = shapely.bounds(area).tolist()
+    wide = _widened(area, 2.0 * COPERNICUS_DEM.gsd_m)
+    box = shapely.bounds(wide).tolist()
     since = _day(request.since)
     found: dict[str, tuple[ArchiveImage, Any]] = {}
     terrain: dict[str, Any] = {}
@@ -119,9 +120,15 @@ def find_candidates(
     for source in request.catalogues:
         wanted = archive.collections + (() if request.terrain else COPERNICUS_DEM.collections)
         # Dates of a terrain are those of its production, before any `since`.
-        catalogue = read_catalogue(source, box, None, progress, elsewhere=True, collections=wanted)
+        try:
+            catalogue = read_catalogue(source, box, None, progress, elsewhere=True, collections=wanted)
+        except NoItems as error:
+            problems.append(str(error))
+            continue
         problems += catalogue.problems
-        for item in catalogue.items.read(range(len(catalogue.images))):
+        footprints = catalogue.images.footprint
+        rows = np.flatnonzero(shapely.intersects(footprints, wide)).tolist()
+        for item in catalogue.items.read(rows):
             if item.get("collection") in COPERNICUS_DEM.collections:
                 terrain[item["id"]] = _kept(item, COPERNICUS_DEM, source)
                 continue
@@ -193,17 +200,18 @@ def chosen_dates(
     return chosen
 
 
-def read_bounds(tile: TileArea, archive: Archive) -> shapely.Geometry:
+def read_area(tile: TileArea, archive: Archive) -> shapely.Geometry:
     """What is read of a tile: its part of the region, with the room for chips and searches."""
-    east_m, north_m = metres_per_degree(tile.polygon.centroid.y, 0.0)
     margin_m = CHIP_PX / 2.0 * COARSE_FACTOR * archive.gsd_m * 1.1
-    west, south, east, north = tile.polygon.bounds
-    return shapely.box(
-        west - margin_m / east_m,
-        south - margin_m / north_m,
-        east + margin_m / east_m,
-        north + margin_m / north_m,
-    )
+    return _widened(tile.polygon, margin_m)
+
+
+def _widened(polygon: shapely.Geometry, margin_m: float) -> shapely.Geometry:
+    """Polygons with what lies around them, longitude and latitude."""
+    scale = np.array(metres_per_degree(polygon.centroid.y, 0.0))
+    in_metres = shapely.transform(polygon, lambda lon_lat: lon_lat * scale)
+    wider = shapely.buffer(in_metres, margin_m, join_style="mitre")
+    return shapely.transform(wider, lambda metres: metres / scale)
 
 
 def plan_base(
@@ -219,10 +227,10 @@ def plan_base(
     chosen = chosen_dates(candidates, tiles, options, lambda tile, number: True)
     dates, full = [], 0
     for tile in tiles:
-        bounds = read_bounds(tile, archive)
+        read = read_area(tile, archive)
         for number in chosen[tile.tile]:
             seen = candidates.images[number].footprint
-            pixels = math.ceil(area_km2(bounds.intersection(seen)) * 1e6 / archive.gsd_m**2)
+            pixels = math.ceil(area_km2(read.intersection(seen)) * 1e6 / archive.gsd_m**2)
             full += math.ceil(area_km2(seen) * 1e6 / archive.gsd_m**2)
             size = pixels * archive.bytes_per_px * (1.02 if archive.mask else 1.0)
             dates.append(PlannedDate(number, tile.tile, pixels, math.ceil(size)))
@@ -257,8 +265,3 @@ def _kept(item: Any, archive: Archive, source: str) -> Any:
     links = [link for link in item.get("links") or [] if link.get("rel") == "self"]
     kept = {name: item.get(name) for name in ("type", "id", "collection", "geometry", "properties")}
     return {**kept, "assets": assets, "links": links, "catalogue": source}
-
-
-def sample_border(polygon: shapely.Geometry) -> Any:
-    """Places (n, 2) along the border of a polygon, longitude and latitude."""
-    return np.asarray(shapely.get_coordinates(shapely.segmentize(polygon.exterior, 0.05)))

@@ -12,7 +12,7 @@ import shapely
 
 from amers.app.errors import InputError
 from amers.app.usecases.base.request import BaseOptions
-from amers.app.usecases.base.search import Candidates, read_bounds, sample_border
+from amers.app.usecases.base.search import Candidates, read_area
 from amers.services.errors import CoverageError, FormatError
 from amers.services.formats.addresses import (
     TRAFFIC,
@@ -123,11 +123,10 @@ class WindowReader:
             least = self.options.min_clear / 100.0 * _shown(image, tile)
             if clear < least:
                 return {"refused": f"{100.0 * clear:.0f} % of the region is clear"}
-            border = sample_border(read_bounds(tile, self.archive))
-            copied = copy_window(source, border, self.path(number))
-            shape, full = copied.shape, copied.full
+            copied = copy_window(source, read_area(tile, self.archive), self.path(number))
+            full = copied.full
             return {
-                "pixels": shape[0] * shape[1],
+                "pixels": copied.pixels,
                 "full_pixels": full[0] * full[1],
                 "clear": clear,
                 "valid": copied.valid,
@@ -181,7 +180,7 @@ def refreshed(item: Any) -> Any | None:
 
 
 def read_terrain_windows(
-    candidates: Candidates, bounds: Any, folder: Path, progress: Progress = no_progress
+    candidates: Candidates, area: shapely.Geometry, folder: Path, progress: Progress = no_progress
 ) -> Path:
     """Copy the heights of a region from the terrain of its catalogues; the folder with their tiles.
 
@@ -189,12 +188,11 @@ def read_terrain_windows(
         InputError: the catalogues have no terrain there.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    border = sample_border(bounds)
     for number, item in enumerate(candidates.terrain):
         path = folder / f"{_file_name(item['id'])}.tif"
 
         def read(item: Any, path: Path = path) -> int:
-            return copy_heights(_place(item, COPERNICUS_DEM.image, item["id"]), border, path)
+            return copy_heights(_place(item, COPERNICUS_DEM.image, item["id"]), area, path)
 
         if not path.is_file():
             try:

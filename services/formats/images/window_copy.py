@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import rasterio
+import shapely
 from rasterio.windows import Window as RasterWindow
 
 from amers.services.errors import CoverageError, FormatError
@@ -22,6 +23,8 @@ _PIECE = 1024
 """Lines and samples that are in memory at a time."""
 _TILE = 256
 _ROUNDING_PX = 1e-3
+_EDGE_DEG = 0.05
+"""Length of the edges of an area that are straight on another map."""
 _LARGEST = np.iinfo(np.uint16).max
 
 
@@ -32,12 +35,14 @@ class CopiedWindow:
     Attributes:
         shape: lines and samples of the copy.
         full: lines and samples of the image.
-        valid: share of the copied pixels with data.
+        pixels: number of those that were read.
+        valid: share of the pixels that were read with data.
         clear: share of those with data that the mask does not hide.
     """
 
     shape: tuple[int, int]
     full: tuple[int, int]
+    pixels: int
     valid: float
     clear: float
 
@@ -99,14 +104,15 @@ def clear_share(source: WindowSource, lon_lat: Array) -> float:
     return float(shown.sum() / len(lon_lat))
 
 
-def copy_window(source: WindowSource, bounds: Array, path: Path) -> CopiedWindow:
+def copy_window(source: WindowSource, area: shapely.Geometry, path: Path) -> CopiedWindow:
     """Copy the part of an image that shows an area, as 16 bits, with 0 where the mask hides the ground.
 
-    The file appears when it is complete. Only tiles that the part touches are read.
+    The file appears when it is complete. Only tiles that the area touches are read; the others in the
+    window of the copy have no data.
 
     Args:
         source: the image and its mask on the same map.
-        bounds: (n, 2) longitude and latitude of the border of the area.
+        area: polygons, longitude and latitude.
         path: of the copy, a GeoTIFF in tiles.
 
     Raises:
@@ -116,11 +122,12 @@ def copy_window(source: WindowSource, bounds: Array, path: Path) -> CopiedWindow
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
     try:
         with rasterio.Env(**GDAL_OPTIONS), open_dataset(source.image) as image:
-            window = _window(image, bounds, source.image)
+            needed = _in_pixels(image, area, source.image)
+            window = _window(image, needed, source.image)
             mask = None if source.mask is None else open_dataset(source.mask)
             try:
                 with rasterio.open(partial, "w", **_profile(image, window)) as out:
-                    counts = _copy(source, image, mask, window, out)
+                    counts = _copy(source, (image, mask), window, needed, out)
             finally:
                 if mask is not None:
                     mask.close()
@@ -128,11 +135,12 @@ def copy_window(source: WindowSource, bounds: Array, path: Path) -> CopiedWindow
         partial.rename(path)
     finally:
         partial.unlink(missing_ok=True)
-    total, valid, clear = counts
-    return CopiedWindow((window.height, window.width), full, valid / total, clear / max(valid, 1))
+    read, valid, clear = counts
+    shape = window.height, window.width
+    return CopiedWindow(shape, full, read, valid / max(read, 1), clear / max(valid, 1))
 
 
-def copy_heights(place: FilePlace, bounds: Array, path: Path) -> int:
+def copy_heights(place: FilePlace, area: shapely.Geometry, path: Path) -> int:
     """Copy the part of a file of heights that shows an area; the number of pixels read.
 
     Raises:
@@ -142,7 +150,7 @@ def copy_heights(place: FilePlace, bounds: Array, path: Path) -> int:
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
     try:
         with rasterio.Env(**GDAL_OPTIONS), open_dataset(place) as image:
-            window = _window(image, bounds, place)
+            window = _window(image, _in_pixels(image, area, place), place)
             profile = _profile(image, window) | {
                 "dtype": image.dtypes[0],
                 "nodata": image.nodata,
@@ -159,12 +167,21 @@ def copy_heights(place: FilePlace, bounds: Array, path: Path) -> int:
     return int(window.height * window.width)
 
 
-def _window(image: Any, bounds: Array, place: FilePlace) -> Any:
-    """The pixels of an image that a border on the ground encloses."""
+def _in_pixels(image: Any, area: shapely.Geometry, place: FilePlace) -> shapely.Geometry:
+    """An area on the ground in columns and rows of an image."""
     if image.crs is None or image.transform.is_identity:
         raise FormatError(f"{place}: no map found, an ortho-image on a map expected")
-    column, row = ~image.transform @ continuous_xy(image.crs.to_wkt(), bounds).T
-    top, left, bottom, right = np.nanmin(row), np.nanmin(column), np.nanmax(row), np.nanmax(column)
+    crs, to_pixels = image.crs.to_wkt(), ~image.transform
+
+    def column_row(lon_lat: Array) -> Array:
+        return np.column_stack(to_pixels @ continuous_xy(crs, lon_lat).T)
+
+    return shapely.transform(shapely.segmentize(area, _EDGE_DEG), column_row)
+
+
+def _window(image: Any, area: shapely.Geometry, place: FilePlace) -> Any:
+    """The pixels of an image that an area in its columns and rows reaches."""
+    left, top, right, bottom = area.bounds
     first = max(0, math.floor(top + _ROUNDING_PX)), max(0, math.floor(left + _ROUNDING_PX))
     last = (
         min(image.height, math.ceil(bottom - _ROUNDING_PX)),
@@ -194,10 +211,16 @@ def _profile(image: Any, window: Any) -> dict[str, Any]:
     }
 
 
-def _copy(source: WindowSource, image: Any, mask: Any, window: Any, out: Any) -> tuple[int, int, int]:
+def _copy(
+    source: WindowSource, files: tuple[Any, Any], window: Any, area: shapely.Geometry, out: Any
+) -> tuple[int, int, int]:
     """Copy piece by piece; numbers of pixels, of those with data, and of those not hidden."""
     total = valid = clear = 0
+    image, mask = files
     for piece in _pieces(window):
+        last = piece.col_off + piece.width, piece.row_off + piece.height
+        if not shapely.intersects(area, shapely.box(piece.col_off, piece.row_off, *last)):
+            continue
         with as_format_error(source.image, "readable pixels"):
             pixels = source.stored(image.read(1, window=piece))
         total, valid = total + pixels.size, valid + int((pixels > 0).sum())

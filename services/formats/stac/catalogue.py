@@ -26,6 +26,10 @@ _REPORTED_EVERY = 500
 _LON_LAT_CRS = ("CRS84", "4326")
 
 
+class NoItems(FormatError):
+    """A catalogue has no item, or none of what a search asks for."""
+
+
 @dataclass(frozen=True)
 class StacCatalogue:
     """What was read of a catalogue.
@@ -94,6 +98,7 @@ def read_catalogue(
         collections: ids, which a search API is asked for; all by default.
 
     Raises:
+        NoItems: the source has no item.
         FormatError: the source is no catalogue, or none of its items can be used.
     """
     query = {} if box is None else {"bbox": ",".join(f"{value:.6f}" for value in box)}
@@ -159,7 +164,7 @@ class _Reader:
                 raise FormatError(
                     f"{source}: none of {self._bad} items can be used; the first: {self._problems[0]}"
                 )
-            raise FormatError(
+            raise NoItems(
                 f"{source}: no STAC item found; a folder, an item, an item collection, a "
                 "catalog, lines of items (.ndjson) or the address of a search API expected"
             )
