@@ -20,7 +20,7 @@ import shapely
 from rasterio.transform import Affine
 
 from amers.services.geodesy import metres_per_degree
-from amers.services.imagery.archives import SENTINEL_2, ArchiveImage
+from amers.services.imagery.archives import COPERNICUS_DEM, SENTINEL_2, ArchiveImage
 from amers.services.map_grid import lon_lat_of_xy, xy_of_lon_lat
 from amers.services.simulation.conditions import clouds_over
 from amers.services.simulation.grid import bilinear_values
@@ -247,6 +247,10 @@ def _write_heights(archive: OpenArchive) -> dict[str, Any]:
     lat = np.arange(north + margin, south - margin, -step)
     grid = np.stack(np.meshgrid(lon, lat), axis=-1)
     heights = archive.world.height_m(grid.reshape(-1, 2)).reshape(grid.shape[:2]) - GEOID_M
+    stated = COPERNICUS_DEM.accuracy[0]
+    rng = np.random.default_rng(13)
+    noise = cv2.resize(natural_noise(rng, 256, 1.0, 0.0), heights.shape[::-1])
+    heights += rng.normal(0.0, stated.common_m) + stated.own_m * noise / noise.std()
     transform = Affine(step, 0.0, lon[0] - step / 2.0, 0.0, -step, lat[0] + step / 2.0)
     path = archive.folder / "data" / "dem.tif"
     write_cog(path, heights.astype(np.float32), "EPSG:4326", transform, nodata=-32767.0)
@@ -375,27 +379,29 @@ class _Handler(BaseHTTPRequestHandler):
         elif name.rpartition("/")[2] in self.faults.gone or not path.is_file():
             self._send(404, b"")
         else:
-            content = path.read_bytes()
-            if path.name in self.faults.broken:
-                middle = len(content) // 2
-                content = content[:2000] + bytes(middle) + content[2000 + middle :]
-            self._range(content)
+            self._range(path)
 
-    def _range(self, content: bytes) -> None:
+    def _range(self, path: Path) -> None:
+        size = path.stat().st_size
         headers = {
             "Last-Modified": "Wed, 21 Oct 2026 07:28:00 GMT",
             "ETag": '"1"',
             "Accept-Ranges": "bytes",
         }
         stated = self.headers.get("Range")
-        if stated is None:
-            self._send(200, content, headers)
-            return
-        first, last = (int(part) for part in stated.removeprefix("bytes=").split("-"))
-        last = min(last, len(content) - 1)
-        headers["Content-Range"] = f"bytes {first}-{last}/{len(content)}"
-        self.sent.append(last + 1 - first)
-        self._send(206, content[first : last + 1], headers)
+        first, last = 0, size - 1
+        if stated is not None:
+            first, last = (int(part) for part in stated.removeprefix("bytes=").split("-"))
+            last = min(last, size - 1)
+            headers["Content-Range"] = f"bytes {first}-{last}/{size}"
+            self.sent.append(last + 1 - first)
+        with path.open("rb") as file:
+            file.seek(first)
+            content = bytearray(file.read(last + 1 - first))
+        if path.name in self.faults.broken:
+            start, end = max(0, 2000 - first), max(0, 2000 + size // 2 - first)
+            content[start:end] = bytes(len(content[start:end]))
+        self._send(200 if stated is None else 206, bytes(content), headers)
 
     def _json(self, document: dict[str, Any]) -> None:
         self._send(200, json.dumps(document).encode())

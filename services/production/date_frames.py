@@ -118,8 +118,9 @@ def _orbits(error_m: Array, orbit: Sequence[str], own_m: Array) -> tuple[float, 
     if len(names) < 2:
         return 0.0, 0.0
     rows = [np.array([one == name for one in orbit]) for name in names]
-    means = np.stack([error_m[row].mean(axis=0) for row in rows])
-    explained = float(np.mean([np.mean(own_m[row] ** 2) / row.sum() for row in rows]))
+    weight = own_m**-2.0
+    means = np.stack([np.average(error_m[row], axis=0, weights=weight[row]) for row in rows])
+    explained = float(np.mean([1.0 / weight[row].sum() for row in rows]))
     found = float(((means - means.mean(axis=0)) ** 2).sum() / (2.0 * (len(names) - 1)))
     apart = np.linalg.norm(means[:, None] - means[None, :], axis=2)
     return float(apart.max()), max(0.0, found - explained)

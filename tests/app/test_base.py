@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
 import shapely
 
 from amers.app.errors import InputError
@@ -19,9 +20,14 @@ from amers.app.usecases.base.making import MadeBase, make_base, plan
 from amers.app.usecases.base.request import BaseOptions, BaseRequest
 from amers.app.usecases.new_block import BlockIdentity
 from amers.services.formats import addresses
+from amers.services.formats.addresses import Address
+from amers.services.formats.block.reader import read_block
 from amers.services.formats.images.raster import write_raster
+from amers.services.formats.images.window_copy import WindowSource, copy_window
 from amers.services.formats.sensor_models.rpc_files import read_rpc
-from amers.services.geodesy import east_north_up
+from amers.services.geodesy import east_north_up, metres_per_degree
+from amers.services.imagery.archives import SENTINEL_2
+from amers.services.map_grid import lon_lat_of_xy
 from amers.services.simulation.view import ViewPlan, simulate_view
 from tests.app.test_production_run import content
 from tests.command_line import amers_here
@@ -123,6 +129,18 @@ def test_the_frame_of_the_base_is_as_far_off_as_stated(archive, base) -> None:
     assert made["sigma_m"] < 4.5, "many dates and two orbits agree"
 
 
+def test_the_heights_are_as_far_off_as_stated(archive, base) -> None:
+    block, made, _ = base
+    points = read_block(block).points
+    ground = points.lon_lat_h[:, :2] - frame_error_m(archive, made) / metres_per_degree(CENTRE[1], 0.0)
+    error_m = points.lon_lat_h[:, 2] - archive.world.height_m(ground)
+    common_m, own_m = error_m.mean(), error_m.std(ddof=1)
+    sigma_m = np.sqrt(np.median(points.covariance_m2[:, 2, 2]))
+    print(f"heights: all {common_m:.2f} m, each {own_m:.2f} m, stated {sigma_m:.2f} m")
+    assert 0.6 < own_m / sigma_m < 1.4, "20 points show it no better"
+    assert abs(common_m) < 3.0 * points.frames[0].sigma_up_m
+
+
 def test_a_plan_reads_no_image_and_foresees_the_bytes(archive, tmp_path) -> None:
     with running_archive(archive) as server:
         planned, candidates = plan(request_of(archive, server.url))
@@ -132,6 +150,31 @@ def test_a_plan_reads_no_image_and_foresees_the_bytes(archive, tmp_path) -> None
     images = {candidates.images[date.image].id for date in planned.dates}
     used = {image.id for tile in made.placed.tiles for image in tile.images}
     assert len(images & used) > 0.6 * len(used)
+
+
+def test_of_a_large_image_only_the_tiles_around_the_region_are_sent(archive, tmp_path) -> None:
+    rng = np.random.default_rng(4)
+    pixels = rng.integers(1000, 4000, (5000, 5000), dtype=np.uint16)
+    crs, transform = map_of("32TLP")
+    path = archive.folder / "data" / "large_red.tif"
+    write_cog(path, pixels, crs, transform, blockxsize=512, blockysize=512)
+    corner = np.array([[transform.c + 20_000.0, transform.f - 20_000.0]])
+    region = shapely.box(
+        *lon_lat_of_xy(crs, corner - 4_000.0)[0], *lon_lat_of_xy(crs, corner + 4_000.0)[0]
+    )
+    with running_archive(archive) as server:
+        source = WindowSource(Address(f"{server.url}/data/large_red.tif"), None, SENTINEL_2)
+        copied = copy_window(source, region, tmp_path / "copy.tif")
+    bytes_share = sum(server.sent) / path.stat().st_size
+    print(f"{bytes_share:.3f} of the bytes, {copied.pixels / pixels.size:.3f} of the pixels")
+    assert bytes_share < 1.0 / 3.0
+    assert copied.pixels < pixels.size / 20
+    with rasterio.open(tmp_path / "copy.tif") as copy:
+        row = round((transform.f - copy.transform.f) / GSD_M)
+        column = round((copy.transform.c - transform.c) / GSD_M)
+        part = pixels[row : row + copy.height, column : column + copy.width]
+        np.testing.assert_array_equal(copy.read(1), part)
+    path.unlink()
 
 
 def later_scene(archive: OpenArchive, folder: Path, name: str) -> Path:

@@ -224,8 +224,9 @@ def _metadata(
     identity: BlockIdentity, making: _Making, made: MadeBase, gsds_m: tuple[float, ...]
 ) -> BlockMetadata:
     points, placed, archive = made.points, made.placed, making.archive
+    title = identity.title or f"{identity.id}. {made.attribution.partition(';')[0]}"
     return block_metadata(
-        identity,
+        replace(identity, title=title),
         [scene.acquisition for tile in placed.tiles for scene in tile.scenes],
         points,
         description=(
