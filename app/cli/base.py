@@ -1,4 +1,4 @@
-"""`amers base make`: a base of control points for a region, from an open archive of ortho-images."""
+"""`amers base`: bases of control points for a region, from open archives of ortho-images."""
 
 import math
 from pathlib import Path
@@ -13,6 +13,7 @@ from amers.app.cli.progress import shown_progress
 from amers.app.usecases.base.making import MadeBase, make_base, plan
 from amers.app.usecases.base.request import BaseOptions, BaseRequest
 from amers.app.usecases.base.search import BasePlan, Candidates
+from amers.app.usecases.base.updating import update_base
 from amers.app.usecases.new_block import BlockIdentity
 from amers.app.usecases.terrain_file import TerrainFile
 
@@ -86,6 +87,34 @@ def make(
             planned, candidates = plan(request, options, progress)
     row = _plan_row(planned, candidates) if only_plan else _made_row(output, made, as_json=as_json)
     show_one(row, as_json=as_json)
+
+
+def update(
+    work: Annotated[Path, typer.Argument(help="Work folder of the base (--work).", exists=True)],
+    *,
+    output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the block.")],
+    catalogue: Annotated[
+        list[str] | None, typer.Option(help="STAC: in place of the catalogues of the base.")
+    ] = None,
+    new_dates: Annotated[
+        int, typer.Option(help="New clear dates that every place gets.", min=1, max=20)
+    ] = 2,
+    version: Annotated[
+        str | None, typer.Option(help="Version of the block; by default the next number.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make the next version of a base: new dates become views, vanished points leave, gaps fill."""
+    with shown_progress() as progress:
+        made = update_base(
+            work,
+            output,
+            catalogues=tuple(catalogue or ()),
+            new_dates=new_dates,
+            version=version,
+            progress=progress,
+        )
+    show_one(_made_row(output, made, as_json=as_json), as_json=as_json)
 
 
 def _plan_row(planned: BasePlan, candidates: Candidates) -> Row:

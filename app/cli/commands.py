@@ -59,6 +59,11 @@ COMMANDS: Tree = {
                 "base:make",
                 "Make a base of control points for a region from an open archive of images, in one go.",
             ),
+            "update": Command(
+                "base:update",
+                "Make the next version of a base: new dates become views, vanished points leave, gaps "
+                "fill.",
+            ),
         },
     ),
     "points": Group(

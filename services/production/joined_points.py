@@ -8,8 +8,14 @@ import shapely
 
 from amers.services.errors import NotEnoughPoints
 from amers.services.geodesy import move_metres
+from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import render_chip
+from amers.services.matching.multi_image import chip_inside, nearly_whole
 from amers.services.production.ortho_production import GroundHeights, OrthoPoints
 from amers.services.types import Acquisition, Array, ChipArray, ControlPoints, Frame, IntArray, Views
+
+_LATEST = 2
+"""Latest images that must contradict a point."""
 
 
 @dataclass(frozen=True)
@@ -18,11 +24,13 @@ class TilePoints:
 
     Attributes:
         production: with the positions of its first image.
+        rows: (n,) of its points that are taken.
         polygon: longitude and latitude; points beyond it belong to other tiles.
         move_m: (2,) east, north, from the first image into the frame of the block.
     """
 
     production: OrthoPoints
+    rows: IntArray
     polygon: shapely.Geometry
     move_m: Array
 
@@ -57,7 +65,7 @@ def joined_points(
         covariance_m2[:, 2, 2] = heights.sigma_m(lon_lat_h[:, :2]) ** 2
         points = replace(points, lon_lat_h=lon_lat_h, covariance_m2=covariance_m2, frames=(frame,))
         inside = np.asarray(shapely.contains_xy(tile.polygon, lon_lat_h[:, :2]))
-        rows = np.flatnonzero(inside & np.isfinite(lon_lat_h[:, 2]))
+        rows = tile.rows[(inside & np.isfinite(lon_lat_h[:, 2]))[tile.rows]]
         rows = rows[_far_from(lon_lat_h[rows], placed, min_distance_m)]
         images |= {one.image_id: one for one in points.views.images}
         parts.append(_numbered(points.take(rows), list(images)))
@@ -71,6 +79,32 @@ def joined_points(
         return tiles[number].production.chips(of_tile)
 
     return _concatenated(parts, tuple(images.values())), chips
+
+
+def still_found(production: OrthoPoints, latest: Sequence[Scene]) -> IntArray:
+    """Rows (n,) of the points that the latest images do not contradict.
+
+    A point has vanished where two or more of them show its whole chip, and it was found in none.
+
+    Args:
+        production: of the latest and earlier images.
+        latest: images, of which the production has those that show its points.
+    """
+    points = production.points
+    of_view = np.repeat(np.arange(len(points)), np.diff(points.views.start))
+    shown = np.zeros(len(points), dtype=np.int64)
+    found = np.zeros(len(points), dtype=np.bool_)
+    gsd_m = production.gsds_m[0]
+    for scene in latest:
+        whole = chip_inside(scene.model, scene.image.shape, points.lon_lat_h, gsd_m)
+        for row in np.flatnonzero(whole).tolist():
+            chip = render_chip(scene.image, scene.model, points.lon_lat_h[row], gsd_m)
+            shown[row] += nearly_whole(chip)
+        names = [one.image_id for one in points.views.images]
+        if scene.acquisition.image_id in names:
+            image = names.index(scene.acquisition.image_id)
+            found[of_view[points.views.image == image]] = True
+    return np.flatnonzero(found | (shown < _LATEST))
 
 
 def _far_from(lon_lat_h: Array, placed: Array, least_m: float) -> IntArray:

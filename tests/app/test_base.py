@@ -2,10 +2,12 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +23,13 @@ from amers.app.usecases.base.request import BaseOptions, BaseRequest
 from amers.app.usecases.new_block import BlockIdentity
 from amers.services.formats import addresses
 from amers.services.formats.addresses import Address
-from amers.services.formats.block.reader import read_block
+from amers.services.formats.block.reader import read_block, read_document
 from amers.services.formats.images.raster import write_raster
 from amers.services.formats.images.window_copy import WindowSource, copy_window
 from amers.services.formats.sensor_models.rpc_files import read_rpc
 from amers.services.geodesy import east_north_up, metres_per_degree
 from amers.services.imagery.archives import SENTINEL_2
-from amers.services.map_grid import lon_lat_of_xy
+from amers.services.map_grid import lon_lat_of_xy, xy_of_lon_lat
 from amers.services.simulation.view import ViewPlan, simulate_view
 from tests.app.test_production_run import content
 from tests.command_line import amers_here
@@ -289,6 +291,62 @@ def test_a_process_that_is_killed_leaves_what_it_read(archive, tmp_path) -> None
         done = amers_here(words, os.environ)
         assert done.returncode == 0, done.stderr
     assert content(tmp_path / "again") == content(tmp_path / "whole")
+
+
+def vanished(path: Path, place: np.ndarray, copy: Path) -> None:
+    """A copy of an image on which other ground lies within 700 m of a place."""
+    with rasterio.open(path) as image:
+        pixels, profile = image.read(1), image.profile
+        (x, y), reach = xy_of_lon_lat(image.crs.to_wkt(), place[None, :2])[0], 70
+        column, row = (round(value) for value in ~image.transform @ (x, y))
+    part = pixels[max(0, row - reach) : row + reach, max(0, column - reach) : column + reach]
+    part[:] = np.random.default_rng(8).integers(1500, 5000, part.shape)
+    with rasterio.open(copy, "w", **profile) as out:
+        out.write(pixels, 1)
+
+
+def test_an_update_reads_new_dates_alone_and_drops_what_they_contradict(archive, tmp_path) -> None:
+    earlier = [one for one in archive.items if one["properties"]["datetime"] < "2022-09-01"]
+    old, new = (replace(archive, folder=tmp_path / name, items=[]) for name in ("old", "new"))
+    for one, items in ((old, earlier), (new, archive.items)):
+        one.folder.mkdir()
+        (one.folder / "data").symlink_to(archive.folder / "data")
+        one.items.extend(items)
+    work, region = tmp_path / "work", small_part(archive)
+    with running_archive(old) as server:
+        first = make_base(
+            request_of(archive, server.url, bbox=region),
+            tmp_path / "a",
+            BlockIdentity("b"),
+            FEW,
+            work=work,
+        )
+    gone = read_block(tmp_path / "a").points.lon_lat_h[0]
+    (new.folder / "data").unlink()
+    shutil.copytree(archive.folder / "data", new.folder / "data")
+    for item in archive.items:
+        if item["properties"]["datetime"] > "2022-09-01":
+            name = f"{item['id']}_red.tif"
+            vanished(archive.folder / "data" / name, gone, new.folder / "data" / name)
+    with running_archive(new) as server:
+        words = ["base", "update", work, "--catalogue", server.url, "-o", tmp_path / "c", "--json"]
+        done = amers_here(words, os.environ)
+        assert done.returncode == 0, done.stderr
+        made = json.loads(done.stdout)
+        images = {one.partition("?")[0].rpartition("/")[2] for one in server.asked if "_red" in one}
+    assert images
+    assert all(name[10:18] > "20220901" for name in images), "images of before were read again"
+    metadata = read_document(tmp_path / "c").metadata
+    assert (metadata.id, metadata.version) == ("b", "2")
+    assert sum(date > "2022-09-01" for date in made["dates"]) >= 2
+    points = read_block(tmp_path / "c").points.lon_lat_h
+    off_m = np.linalg.norm((points - gone)[:, :2] * metres_per_degree(CENTRE[1], 0.0), axis=1)
+    assert off_m.min() > 100.0, "the point that vanished is still there"
+    assert len(points) >= len(first.points) - 4
+    again = amers_here(
+        ["base", "update", work, "--catalogue", str(old.folder), "-o", tmp_path / "d"], os.environ
+    )
+    assert again.returncode != 0
 
 
 def test_the_archive_can_be_a_folder_and_the_region_a_file_or_a_scene(archive, tmp_path) -> None:

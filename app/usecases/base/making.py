@@ -1,7 +1,9 @@
 """Make a base: search, choose and read images of an archive, find points that last, write a block."""
 
+import json
 import math
 import shutil
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -37,17 +39,19 @@ from amers.app.usecases.new_block import (
     refuse_existing,
 )
 from amers.app.usecases.terrain_file import TerrainFile, read_terrain
-from amers.services.formats.addresses import TRAFFIC, without_query
+from amers.services.formats.addresses import without_query
 from amers.services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification
 from amers.services.formats.block.writer import write_block
 from amers.services.formats.work_folder import WorkFolder
 from amers.services.geodesy import box_around
 from amers.services.imagery.archives import COPERNICUS_DEM, Archive
+from amers.services.production.date_choice import TileArea
 from amers.services.production.joined_points import TilePoints, joined_points
 from amers.services.production.ortho_production import GroundHeights
 from amers.services.types import ControlPoints, Frame, Progress, no_progress, part_of
 
-_CANDIDATES = "candidates.json"
+CANDIDATES, CHOSEN = "candidates.json", "chosen.json"
+"""Files of a work folder: what catalogues have, and what the last block was made of."""
 _OPTIONS = BaseOptions()
 
 
@@ -83,8 +87,15 @@ class MadeBase:
 
 
 @dataclass(frozen=True)
-class _Making:
-    """A request with what it means."""
+class Making:
+    """A request with what it means.
+
+    Attributes:
+        request: where, and of what.
+        options: of dates and points.
+        area: the region.
+        archive: of the images.
+    """
 
     request: BaseRequest
     options: BaseOptions
@@ -92,19 +103,21 @@ class _Making:
     archive: Archive
 
     def candidates(self, progress: Progress) -> Candidates:
+        """What the catalogues have."""
         return find_candidates(self.request, self.archive, self.area, self.options, progress)
 
     def plan(self, candidates: Candidates) -> BasePlan:
+        """Which of it is read."""
         reads_terrain = self.request.terrain is None
         return plan_base(candidates, self.area, self.archive, self.options, reads_terrain=reads_terrain)
 
-    def heights(self, candidates: Candidates, plan: BasePlan, kept: Path) -> GroundHeights:
+    def heights(self, candidates: Candidates, tiles: Sequence[TileArea], kept: Path) -> GroundHeights:
         """The heights of the ground, of the files of the user or of the catalogues."""
         sigma_m, up_m = self.options.height_sigma_m, self.options.frame_sigma_up_m
         if self.request.terrain is not None:
             terrain = read_terrain(self.request.terrain, sigma_m)
             return GroundHeights(terrain, frame_sigma_m=math.nan if up_m is None else up_m)
-        area = shapely.union_all([read_area(tile, self.archive) for tile in plan.tiles])
+        area = shapely.union_all([read_area(tile, self.archive) for tile in tiles])
         folder = read_terrain_windows(candidates, area, kept / "terrain")
         stated = COPERNICUS_DEM.accuracy[0]
         file = TerrainFile(folder, "EGM2008", self.request.geoid)
@@ -120,7 +133,7 @@ def plan(
     Raises:
         InputError: the region, the archive or a catalogue cannot be used.
     """
-    making = _Making(request, options, area_of(request), archive_of(request.source))
+    making = Making(request, options, area_of(request), archive_of(request.source))
     candidates = making.candidates(progress)
     return making.plan(candidates), candidates
 
@@ -149,39 +162,83 @@ def make_base(
         ComputationError: the images have too few points in common.
     """
     refuse_existing(folder)
-    before = TRAFFIC.bytes
-    making = _Making(request, options, area_of(request), archive_of(request.source))
+    making = Making(request, options, area_of(request), archive_of(request.source))
     kept = work or folder.with_name(f"{folder.name}.work")
     WorkFolder(kept, _inputs(making))
     (kept / "images").mkdir(exist_ok=True)
-    if not (kept / _CANDIDATES).is_file():
-        write_candidates(kept / _CANDIDATES, making.candidates(part_of(progress, 0.0, 0.1)))
-    candidates = read_candidates(kept / _CANDIDATES, making.archive)
+    if not (kept / CANDIDATES).is_file():
+        write_candidates(kept / CANDIDATES, making.candidates(part_of(progress, 0.0, 0.1)))
+    candidates = read_candidates(kept / CANDIDATES, making.archive)
     planned = making.plan(candidates)
     reading = part_of(progress, 0.1, 0.4)
     reader = WindowReader(
         kept / "images", making.archive, candidates, options, reading, len(planned.dates)
     )
     chosen = chosen_dates(candidates, planned.tiles, options, reader.take)
-    with ExitStack() as stack:
-        heights = making.heights(candidates, planned, kept)
-        tiles = opened_tiles(planned.tiles, chosen, reader, stack)
-        gsd_m = making.archive.gsd_m
-        placed = placed_dates(tiles, heights, gsd_m, part_of(progress, 0.5, 0.1))
-        parts = points_of_tiles(placed, heights, reader, part_of(progress, 0.6, 0.3))
-        frame = Frame.from_sigmas(placed.frames.sigma_m, heights.frame_sigma_m)
-        least_m = 0.7 * spacing_m(options, making.archive)
-        points, chips = joined_points(parts, heights, frame, least_m)
-        made = _made(making, points, placed, reader, parts)
-        made = replace(made, bytes=TRAFFIC.bytes - before)
-        metadata = _metadata(identity, making, made, parts[0].production.gsds_m)
-        write_block(folder, metadata, points, chips, {}, progress=part_of(progress, 0.9, 0.1))
+    finishing = Finishing(making, reader, planned.tiles, chosen, frozenset())
+    made = finishing.write(folder, identity, part_of(progress, 0.5, 0.5))
     if work is None:
         shutil.rmtree(kept)
+    else:
+        finishing.remember(kept / CHOSEN, identity)
     return made
 
 
-def _inputs(making: _Making) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Finishing:
+    """A base whose images are read.
+
+    Attributes:
+        making: its request.
+        reader: of its images.
+        tiles: parts of the region.
+        chosen: numbers of the images of every tile.
+        recent: ids of images that must show a point for it to stay.
+    """
+
+    making: Making
+    reader: WindowReader
+    tiles: list[TileArea]
+    chosen: dict[str, list[int]]
+    recent: frozenset[str]
+
+    def write(self, folder: Path, identity: BlockIdentity, progress: Progress) -> MadeBase:
+        """Make the points and write the block.
+
+        Raises:
+            InputError: heights cannot be used.
+            ComputationError: the images have too few points in common.
+        """
+        making, reader = self.making, self.reader
+        with ExitStack() as stack:
+            heights = making.heights(reader.candidates, self.tiles, reader.folder.parent)
+            tiles = opened_tiles(self.tiles, self.chosen, reader, stack)
+            gsd_m = making.archive.gsd_m
+            placed = placed_dates(tiles, heights, gsd_m, part_of(progress, 0.0, 0.2))
+            parts = points_of_tiles(placed, heights, reader, self.recent, part_of(progress, 0.2, 0.6))
+            frame = Frame.from_sigmas(placed.frames.sigma_m, heights.frame_sigma_m)
+            least_m = 0.7 * spacing_m(making.options, making.archive)
+            points, chips = joined_points(parts, heights, frame, least_m)
+            made = _made(making, points, placed, reader, parts)
+            metadata = _metadata(identity, making, made, parts[0].production.gsds_m)
+            write_block(folder, metadata, points, chips, {}, progress=part_of(progress, 0.8, 0.2))
+        return made
+
+    def remember(self, path: Path, identity: BlockIdentity) -> None:
+        """Keep what an update needs: tiles, images, name and version."""
+        images = self.reader.candidates.images
+        document = {
+            "id": identity.id,
+            "version": identity.version,
+            "tiles": {tile.tile: shapely.to_wkt(tile.polygon, 9) for tile in self.tiles},
+            "images": {name: [images[n].id for n in of_tile] for name, of_tile in self.chosen.items()},
+        }
+        partial = path.with_suffix(".partial")
+        partial.write_text(json.dumps(document), encoding="utf-8")
+        partial.rename(path)
+
+
+def _inputs(making: Making) -> dict[str, Any]:
     """What the content of a work folder depends on; signatures of addresses change."""
     request = asdict(making.request)
     request["catalogues"] = [without_query(one) for one in making.request.catalogues]
@@ -194,7 +251,7 @@ def _inputs(making: _Making) -> dict[str, Any]:
 
 
 def _made(
-    making: _Making,
+    making: Making,
     points: ControlPoints,
     placed: PlacedDates,
     reader: WindowReader,
@@ -212,7 +269,7 @@ def _made(
         placed=placed,
         area_km2=area_km2(making.area),
         left_out=reader.left_out + placed.left_out,
-        bytes=0,
+        bytes=reader.bytes,
         pixels=reader.pixels,
         full_pixels=reader.full_pixels,
         local_sigma_m=float(np.nanmax(local_m)) if np.isfinite(local_m).any() else math.nan,
@@ -221,7 +278,7 @@ def _made(
 
 
 def _metadata(
-    identity: BlockIdentity, making: _Making, made: MadeBase, gsds_m: tuple[float, ...]
+    identity: BlockIdentity, making: Making, made: MadeBase, gsds_m: tuple[float, ...]
 ) -> BlockMetadata:
     points, placed, archive = made.points, made.placed, making.archive
     title = identity.title or f"{identity.id}. {made.attribution.partition(';')[0]}"

@@ -17,7 +17,7 @@ from amers.services.imagery.archives import ArchiveImage
 from amers.services.imagery.scene import Scene
 from amers.services.production.date_choice import TileArea
 from amers.services.production.date_frames import DateFrames, DateShifts, date_frames
-from amers.services.production.joined_points import TilePoints
+from amers.services.production.joined_points import TilePoints, still_found
 from amers.services.production.ortho_production import (
     GroundHeights,
     OrthoPointOptions,
@@ -146,9 +146,20 @@ def placed_dates(
 
 
 def points_of_tiles(
-    placed: PlacedDates, heights: GroundHeights, reader: WindowReader, progress: Progress
+    placed: PlacedDates,
+    heights: GroundHeights,
+    reader: WindowReader,
+    recent: frozenset[str],
+    progress: Progress,
 ) -> list[TilePoints]:
     """The points of every tile, with the way into the frame of the base.
+
+    Args:
+        placed: tiles and frames of the dates.
+        heights: of the ground.
+        reader: of the images.
+        recent: ids of images of which one must show a point, where two could; see `still_found`.
+        progress: receives the fraction done and a message.
 
     Raises:
         NotEnoughPoints: no tile has any.
@@ -163,7 +174,9 @@ def points_of_tiles(
         wanted = area_km2(tile.area.polygon) * 1e6 / step_m**2
         for row, production in _productions(tile, heights, options, wanted, part):
             move_m = placed.move_m(tile.images[row])
-            parts.append(TilePoints(production, tile.area.polygon, move_m))
+            latest = [scene for scene in tile.scenes if scene.acquisition.image_id in recent]
+            rows = still_found(production, latest)
+            parts.append(TilePoints(production, rows, tile.area.polygon, move_m))
     if not parts:
         what = "points that most dates show; give a larger region, more dates or a smaller --min-share"
         raise NotEnoughPoints(0, 6, what)

@@ -66,6 +66,11 @@ class WindowReader:
     _silent: int = 0
     _before: int = field(default_factory=lambda: TRAFFIC.bytes)
 
+    @property
+    def bytes(self) -> int:
+        """Read at addresses so far."""
+        return TRAFFIC.bytes - self._before
+
     def path(self, number: int) -> Path:
         """Of the copy of an image."""
         return self.folder / f"{_file_name(self.candidates.images[number].id)}.tif"
@@ -95,7 +100,7 @@ class WindowReader:
         self.full_pixels += stated["full_pixels"]
         self._taken += 1
         done = min(1.0, self._taken / max(1, self.expected))
-        self.progress(done, f"{self._taken} images, {(TRAFFIC.bytes - self._before) / 1e6:.1f} MB read")
+        self.progress(done, f"{self._taken} images, {self.bytes / 1e6:.1f} MB read")
         return True
 
     def _without_reply(self, error: NoUsableReply) -> bool:
