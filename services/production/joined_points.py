@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
+from scipy.spatial import cKDTree
 
 from amers.services.errors import NotEnoughPoints
-from amers.services.geodesy import move_metres
+from amers.services.geodesy import ecef_from_lon_lat_h, move_metres
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import render_chip
 from amers.services.matching.multi_image import chip_inside, nearly_whole
@@ -109,12 +110,9 @@ def still_found(production: OrthoPoints, latest: Sequence[Scene]) -> IntArray:
 
 def _far_from(lon_lat_h: Array, placed: Array, least_m: float) -> IntArray:
     """Rows of points that no placed one is near."""
-    if not len(placed) or not len(lon_lat_h):
+    if not len(placed):
         return np.arange(len(lon_lat_h))
-    middle = np.radians(placed[:, 1].mean())
-    scale = np.array([111_320.0 * np.cos(middle), 110_570.0])
-    offset_m = (lon_lat_h[:, None, :2] - placed[None, :, :2]) * scale
-    nearest_m = np.linalg.norm(offset_m, axis=2).min(axis=1)
+    nearest_m, _ = cKDTree(ecef_from_lon_lat_h(placed)).query(ecef_from_lon_lat_h(lon_lat_h))
     return np.flatnonzero(nearest_m >= least_m)
 
 

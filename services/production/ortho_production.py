@@ -21,6 +21,7 @@ from amers.services.statements import Statements
 from amers.services.terrain import Terrain
 from amers.services.types import (
     Array,
+    BoolArray,
     ChipArray,
     ControlPoints,
     FloatImage,
@@ -100,6 +101,11 @@ class GroundHeights:
         return np.full(len(lon_lat), self.flat_sigma_m)
 
 
+def everywhere(lon_lat: Array) -> BoolArray:
+    """True (n,) for all places (n, 2)."""
+    return np.ones(len(lon_lat), dtype=np.bool_)
+
+
 @dataclass(frozen=True)
 class OrthoPoints:
     """The points of ortho-images.
@@ -130,6 +136,7 @@ def produce_ortho_points(
     heights: GroundHeights,
     options: OrthoPointOptions = OrthoPointOptions(),
     progress: Progress = no_progress,
+    wanted: Callable[[Array], BoolArray] = everywhere,
 ) -> OrthoPoints:
     """Control points with chips, produced from ortho-images of one place and the heights of its ground.
 
@@ -147,6 +154,7 @@ def produce_ortho_points(
         heights: of the ground.
         options: thresholds.
         progress: receives the fraction done.
+        wanted: whether the squares with centres (n, 2), longitude and latitude, need a point.
 
     Raises:
         InputError: a scene has a parallax, so that it is no ortho-image, or two have one name.
@@ -156,6 +164,11 @@ def produce_ortho_points(
     _check_scenes(scenes)
     scene, gsds_m = scenes[0], _gsds_m(scenes, options)
     squares = _squares(scene, scene_gsd_m(scene), options)
+    squares = [
+        square
+        for square, is_wanted in zip(squares, wanted(_centres(scene, squares)), strict=True)
+        if is_wanted
+    ]
     search = part_of(progress, 0.0, 0.9 if len(scenes) == 1 else 0.5)
     corners = _corners(scenes, heights, squares, gsds_m[0], options, progress=search)
     lon_lat_h = np.array([corner.lon_lat_h for corner in corners]).reshape(-1, 3)
@@ -303,6 +316,14 @@ def _squares(scene: Scene, gsd_m: float, options: OrthoPointOptions) -> list[Win
         for top, bottom in pairwise(line)
         for left, right in pairwise(sample)
     ]
+
+
+def _centres(scene: Scene, squares: Sequence[Window]) -> Array:
+    """Longitudes and latitudes (n, 2) of the centres of windows."""
+    line_sample = np.array(
+        [[one.line + one.lines / 2.0, one.sample + one.samples / 2.0] for one in squares]
+    )
+    return scene.model.locate(line_sample.reshape(-1, 2), np.zeros(len(squares)))[:, :2]
 
 
 def _salient_corners(

@@ -111,7 +111,7 @@ def find_candidates(
             "--catalogue: nothing found; a folder, a file or the address of a search API expected. "
             "docs/methods/base.md lists public ones"
         )
-    wide = _widened(area, 2.0 * COPERNICUS_DEM.gsd_m)
+    wide = widened(area, 2.0 * COPERNICUS_DEM.gsd_m)
     box = shapely.bounds(wide).tolist()
     since = _day(request.since)
     found: dict[str, tuple[ArchiveImage, Any]] = {}
@@ -203,10 +203,10 @@ def chosen_dates(
 def read_area(tile: TileArea, archive: Archive) -> shapely.Geometry:
     """What is read of a tile: its part of the region, with the room for chips and searches."""
     margin_m = CHIP_PX / 2.0 * COARSE_FACTOR * archive.gsd_m * 1.1
-    return _widened(tile.polygon, margin_m)
+    return widened(tile.polygon, margin_m)
 
 
-def _widened(polygon: shapely.Geometry, margin_m: float) -> shapely.Geometry:
+def widened(polygon: shapely.Geometry, margin_m: float) -> shapely.Geometry:
     """Polygons with what lies around them, longitude and latitude."""
     scale = np.array(metres_per_degree(polygon.centroid.y, 0.0))
     in_metres = shapely.transform(polygon, lambda lon_lat: lon_lat * scale)

@@ -1,18 +1,21 @@
 """The copies of tiles as scenes, the frame that their dates give, and the points of every tile."""
 
+import math
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
+from scipy.spatial import cKDTree
 
 from amers.app.errors import InputError
 from amers.app.usecases.base.request import BaseOptions, area_km2
-from amers.app.usecases.base.search import COARSE_FACTOR, spacing_m
+from amers.app.usecases.base.search import COARSE_FACTOR, spacing_m, widened
 from amers.app.usecases.base.windows import WindowReader
 from amers.services.errors import NotEnoughPoints
 from amers.services.formats.images.scenes import read_scene
+from amers.services.geodesy import metres_per_degree
 from amers.services.imagery.archives import ArchiveImage
 from amers.services.imagery.scene import Scene
 from amers.services.production.date_choice import TileArea
@@ -25,7 +28,7 @@ from amers.services.production.ortho_production import (
     produce_ortho_points,
     shifts_of_scenes,
 )
-from amers.services.types import Array, Progress, part_of
+from amers.services.types import Array, BoolArray, Progress, part_of
 
 _TIE_POINTS = 80
 """Squares whose corners show by how much a date lies off another."""
@@ -33,9 +36,13 @@ _MOST_FIRST = 3
 """Dates of a tile whose details become points: later ones where clouds or swaths hide the first."""
 _ENOUGH = 0.8
 """Share of the squares that have points, from which on no other date is tried."""
+_LEAST_SQUARES = 6.0
+"""Squares along the side of a region: points around a small one show the shifts of images, too."""
+_EMPTY = 0.6
+"""Distance of a square's centre from all points, sides of a square, from which on it has none."""
 _LEAST_VIEWS = 2
 _LOCAL_SIGMA_PX = 0.1
-"""Least error of details where two orbits agree, pixels of the image. Two dates of Berlin have 0.064
+"""Least error of details where two orbits agree, pixels of the image. Two dates of Berlin have 0.09
 (`pytest -s tests/journeys/test_real_base.py`); orbits look from two sides, and would show errors of the
 terrain that was used for the images."""
 
@@ -171,8 +178,7 @@ def points_of_tiles(
     parts = []
     for number, tile in enumerate(placed.tiles):
         part = part_of(progress, number / len(placed.tiles), 1.0 / len(placed.tiles))
-        wanted = area_km2(tile.area.polygon) * 1e6 / step_m**2
-        for row, production in _productions(tile, heights, options, wanted, part):
+        for row, production in _productions(tile, heights, options, step_m, part):
             move_m = placed.move_m(tile.images[row])
             latest = [scene for scene in tile.scenes if scene.acquisition.image_id in recent]
             rows = still_found(production, latest)
@@ -194,21 +200,32 @@ def _point_options(options: BaseOptions, gsd_m: float, step_m: float) -> OrthoPo
 
 
 def _productions(
-    tile: BaseTile, heights: GroundHeights, options: OrthoPointOptions, wanted: float, progress: Progress
+    tile: BaseTile, heights: GroundHeights, options: OrthoPointOptions, step_m: float, progress: Progress
 ) -> list[tuple[int, OrthoPoints]]:
-    """Points of a tile: of its first image, then of others while squares have none."""
+    """Points of a tile: of its first image, then of others in squares that have none."""
     made: list[tuple[int, OrthoPoints]] = []
-    count = 0
+    side_m = 1000.0 * math.sqrt(area_km2(tile.area.polygon))
+    around = widened(tile.area.polygon, max(step_m, _LEAST_SQUARES * step_m - side_m) / 2.0)
+    scale = np.array(metres_per_degree(tile.area.polygon.centroid.y, 0.0))
+    known = np.empty((0, 2))
+
+    def wanted(lon_lat: Array) -> BoolArray:
+        inside = np.asarray(shapely.contains_xy(around, lon_lat))
+        if not len(known):
+            return inside
+        apart_m, _ = cKDTree(known * scale).query(lon_lat * scale)
+        return np.asarray(inside & (apart_m > _EMPTY * step_m))
+
+    squares = area_km2(tile.area.polygon) * 1e6 / step_m**2
     for row in range(min(_MOST_FIRST, len(tile.scenes))):
         scenes = [tile.scenes[row], *(s for i, s in enumerate(tile.scenes) if i != row)]
         part = part_of(progress, row / _MOST_FIRST, 1.0 / _MOST_FIRST)
         try:
-            production = produce_ortho_points(scenes, heights, options, part)
+            production = produce_ortho_points(scenes, heights, options, part, wanted)
         except NotEnoughPoints:
             continue
         made.append((row, production))
-        inside = shapely.contains_xy(tile.area.polygon, production.points.lon_lat_h[:, :2])
-        count += int(np.sum(inside))
-        if count >= _ENOUGH * wanted:
+        known = np.concatenate([known, production.points.lon_lat_h[:, :2]])
+        if len(known) >= _ENOUGH * squares:
             break
     return made
