@@ -1,15 +1,16 @@
-"""Tiles of registered scenes and of surfaces, in the form of OGC API - Tiles, for their owners."""
+"""Tiles of registered scenes, of surfaces and of references, in the form of OGC API - Tiles."""
 
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Response
 
-from amers.app.api.deps import DatabaseDep, Reader, StorageDep
+from amers.app.api.deps import DatabaseDep, Reader, Registrar, SettingsDep, StorageDep
 from amers.app.api.jobs import JobId
 from amers.app.api.paths import PathNumber
 from amers.app.api.routes import CallerRoute
 from amers.app.api.tiles import refuse_other_matrix_set
 from amers.app.usecases import jobs
+from amers.app.usecases.reference_map import reference_tile
 from amers.app.usecases.scene_map import Layer, scene_tile
 from amers.app.usecases.surface_map import surface_tile
 from amers.services.formats.images.map_tiles import tile_media_type
@@ -56,4 +57,23 @@ def map_tile(
     # Results never change; browsers ask again each time, so that the token is checked for every tile.
     tag = f'"{job.id}-{job.attempt}"'
     headers = {"ETag": tag, "Cache-Control": "private, no-cache", "X-Content-Type-Options": "nosniff"}
+    return Response(tile, media_type=tile_media_type(tile), headers=headers)
+
+
+@router.get(
+    "/references/{name}/tiles/{matrix_set}/{z}/{y}/{x}",
+    response_class=Response,
+    responses={
+        200: {"description": "An image.", "content": {"image/jpeg": {}, "image/png": {}}},
+    },
+)
+def reference_map_tile(
+    *, name: str, place: TilePlaceDep, database: DatabaseDep, settings: SettingsDep, caller: Registrar
+) -> Response:
+    """Return a tile of a reference image, in grey, at zooms near to that of its pixels.
+
+    z, y and x are tile matrix, row and column. At the border a tile is transparent.
+    """
+    tile = reference_tile(database, settings, name, place)
+    headers = {"Cache-Control": "private, max-age=600", "X-Content-Type-Options": "nosniff"}
     return Response(tile, media_type=tile_media_type(tile), headers=headers)

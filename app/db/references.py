@@ -114,6 +114,12 @@ def list_references(connection: Connection) -> list[ReferenceRow]:
     return every(ReferenceRow, connection.execute(statement))
 
 
+def find_reference(connection: Connection, name: str) -> ReferenceRow | None:
+    """The reference of a name; None without one."""
+    statement = select(*COLUMNS).where(reference_image.c.name == name)
+    return first(ReferenceRow, connection.execute(statement))
+
+
 def read_reference_files(connection: Connection) -> list[NamedFile]:
     """The files of all references, each once; the size is not recorded."""
     checksums: dict[str, str | None] = {}

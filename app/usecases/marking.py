@@ -9,7 +9,7 @@ import numpy as np
 
 from amers.app.config import Settings
 from amers.app.db import references
-from amers.app.db.engine import Connection, Database
+from amers.app.db.engine import Database
 from amers.app.db.jobs.jobs import Job
 from amers.app.errors import DamagedFile, InputError
 from amers.app.storage import Storage
@@ -165,29 +165,28 @@ class HeightSource:
         name: of the reference that it is of; None where no reference has one.
         file: of the terrain.
         sigma_m: one standard deviation of its heights; None for that of the terrain.
+        outline: (n, 2) lon, lat of the scene; pieces of the terrain that lie apart are left out.
     """
 
     name: str | None = None
     file: TerrainFile | None = None
     sigma_m: float | None = None
+    outline: Array | None = None
 
     @cached_property
     def terrain(self) -> Terrain | None:
         """The opened terrain."""
-        return None if self.file is None else read_terrain(self.file, self.sigma_m)
+        return None if self.file is None else read_terrain(self.file, self.sigma_m, self.outline)
 
 
 def heights_of_store(database: Database, settings: Settings, scene: Scene) -> HeightSource:
     """The source of heights of an installation for a scene."""
+    outline = scene_footprint(scene)
     with database.reading() as connection:
-        row = _reference_with_heights(connection, scene)
+        row = references.best_reference(connection, outline, has_heights=True)
     if row is None or settings.reference_folder is None:
         return HeightSource()
-    return HeightSource(row.name, reference_files(settings, row).terrain, row.sigma_up_m)
-
-
-def _reference_with_heights(connection: Connection, scene: Scene) -> references.ReferenceRow | None:
-    return references.best_reference(connection, scene_footprint(scene), has_heights=True)
+    return HeightSource(row.name, reference_files(settings, row).terrain, row.sigma_up_m, outline)
 
 
 def adjust_set_marks(

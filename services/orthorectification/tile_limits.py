@@ -94,6 +94,13 @@ class TileLimits:
         )
 
 
+def tile_outline(place: TilePlace) -> Array:
+    """Longitudes and latitudes (4, 2) of the corners of a tile."""
+    grid = TileLimits(place.zoom, place.row, place.row, place.column, place.column).grid()
+    last = TILE_PX - 0.5
+    return grid.lon_lat(np.array([[-0.5, -0.5], [-0.5, last], [last, last], [last, -0.5]]))
+
+
 def choose_tiles(scenes: Sequence[Scene], heights_m: tuple[float, float]) -> list[TileLimits]:
     """The tiles of a scene from the zoom nearest to its ground sampling to one with a few tiles.
 

@@ -2,10 +2,13 @@
 
 import json
 import re
+import time
+from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
+import rasterio
 from playwright.sync_api import Locator, Page, expect
 
 from amers.services.types import Array
@@ -205,6 +208,65 @@ def test_ten_marks_are_set_with_pointer_and_keys_and_saved_as_the_command_reads_
     results = httpx.get(f"{service.url}/jobs/{job}/results", headers=headers).json()
     report = httpx.get(results["report.json"]["href"], headers=headers).json()
     assert_same_residuals(report, before)
+
+
+def test_marks_on_a_reference_image_take_heights_of_its_terrain(
+    visit, world, secret, service, administrator, installation
+):
+    """With the pointer alone, but for what finds a place on the map; one is held out, one changed."""
+    add_reference(service, administrator, installation / "references", world)
+    page = visit(f"#/mark/{uploaded(service, secret, world)}", secret, WIDE)
+    image = opened(page)
+    expect(page.get_by_text("are those of the terrain of land")).to_be_visible()
+    expect(page.get_by_label("Reference image on the map")).to_have_value("land")
+    began = time.monotonic()
+    for place in PICKED:
+        lon, lat, _ = ground_text(world, place).split(", ")
+        field = page.get_by_label("Go to")
+        field.fill(f"{lat}, {lon}")
+        field.press("Enter")
+        page.locator("#map canvas").click()
+        choose_in_image(page, image, place)
+        until_adjusted(page)
+    print(f"ten marks in {time.monotonic() - began:.0f} s")
+    expect(rows(page).get_by_text("used", exact=True)).to_have_count(len(PICKED))
+    assert np.abs(residuals_shown(page)).max() < a_pixel
+    assert {row.locator("td").nth(4).inner_text() for row in rows(page).all()} == {f"{GROUND_H:.2f}"}
+    page.get_by_role("button", name="Show M5").click()
+    until_drawn(page)
+    assert_readable(page, "marks-on-reference")
+    page.set_viewport_size(WIDE)
+    page.emulate_media(color_scheme="light")
+    page.get_by_label("M2 is a check point").check()
+    expect(rows(page).nth(1)).to_contain_text("check")
+    page.get_by_role("button", name="Change M5").click()
+    page.get_by_label("Place in the image").fill("10, 20")
+    page.keyboard.press("Enter")
+    expect(rows(page).last).to_contain_text("rejected")
+    expect(rows(page).last.get_by_label("Name of M5")).to_be_visible()
+    page.get_by_label("Reference image on the map").select_option("none")
+    until_drawn(page)
+    page.screenshot(path=ARTEFACTS / "marks-without-reference.png")
+
+
+def add_reference(service: Service, administrator: str, folder: Path, world: FlatWorld) -> None:
+    """The ground of the world as an ortho-image on the ellipsoid's degrees, and its terrain."""
+    size = world.ground.shape[0]
+    corners = np.array([[-0.5, -0.5], [size - 0.5, size - 0.5]])
+    (west, north), (east, south) = world.true_model.locate(corners, np.full(2, GROUND_H))[:, :2]
+    height_m = np.full((40, 40), GROUND_H, dtype=np.float32)
+    for name, pixels in (("land", world.ground), ("heights", height_m)):
+        rows, columns = pixels.shape
+        grid = rasterio.transform.from_bounds(west, south, east, north, columns, rows)
+        profile = {"driver": "GTiff", "width": columns, "height": rows, "count": 1, "crs": "EPSG:4326"}
+        with rasterio.open(
+            folder / f"{name}.tif", "w", **profile, dtype="float32", transform=grid
+        ) as file:
+            file.write(pixels, 1)
+    files = {"image": "land.tif", "dem": "heights.tif", "vertical": "ellipsoid"}
+    body = {"name": "land", **files, "sigma_m": 0.5, "sigma_up_m": 0.5}
+    headers = {"Authorization": f"Bearer {administrator}"}
+    httpx.post(f"{service.url}/references", json=body, headers=headers).raise_for_status()
 
 
 def assert_same_residuals(report: dict, shown: Array) -> None:

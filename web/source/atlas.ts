@@ -25,8 +25,8 @@ const WORLD: Bounds = [-180, -85, 180, 85];
 const NEAR_PX = 6;
 /** Distance of the degrees of the graticule from the left, lower and upper edges; at the top is the field to go to a place. */
 const LABELS_PX = { left: 6, bottom: 34, top: 62 };
-/** Zoom at which a coordinate is shown, if the map is not closer. */
-const COORDINATE_ZOOM = 11;
+/** Zoom at which a coordinate is shown, if the map is not closer and no view asks for another. */
+export const COORDINATE_ZOOM = 11;
 const PLACE_DECIMALS = 6;
 /** What the operator has chosen to lie below the map; no tiles: land only. */
 interface Background {
@@ -37,7 +37,7 @@ interface Background {
 const MAKER_OF_TOWNS = "Towns: GeoNames, CC BY 4.0";
 
 /** Paths below which tiles are for some callers only. */
-const PROTECTED = ["collections/", "jobs/"];
+const PROTECTED = ["collections/", "jobs/", "references/"];
 
 /** The map and its layers; without WebGL the rest of the page works. */
 export class Atlas {
@@ -49,6 +49,7 @@ export class Atlas {
   private picked: ((position: Position, point?: number) => void) | null = null;
   /** Whether the reader has gone to a place: the page then does not move the map by itself. */
   went = false;
+  coordinateZoom = COORDINATE_ZOOM;
 
   constructor(container: HTMLElement, onPoint: (id: number) => void) {
     this.map = opened(container);
@@ -140,7 +141,7 @@ export class Atlas {
     return comparison;
   }
 
-  /** Show a surface below the outlines of scenes, until the signal aborts; returns what sets its opacity, 0 to 1. */
+  /** Show a surface, or an image, below the outlines of scenes, until the signal aborts; returns what sets its opacity, 0 to 1. */
   async surface({ tiles, ...pyramid }: Pyramid, signal: AbortSignal): Promise<((opacity: number) => void) | null> {
     await this.ready;
     const map = this.map;
@@ -188,12 +189,12 @@ export class Atlas {
     return point && Number(point.properties["id"]);
   }
 
-  /** Mark a position, and show its surroundings at a zoom, if the map is not closer. */
-  async goTo(position: Position, zoom = COORDINATE_ZOOM): Promise<void> {
+  /** Mark a position, and show its surroundings, if the map is not closer. */
+  async goTo(position: Position): Promise<void> {
     this.went = true;
     await this.show("target", [{ type: "Feature", properties: {}, geometry: { type: "Point", coordinates: position } }]);
     const [longitude, latitude] = position as [number, number];
-    this.map?.jumpTo({ center: [longitude, latitude], zoom: Math.max(this.map.getZoom(), zoom) });
+    this.map?.jumpTo({ center: [longitude, latitude], zoom: Math.max(this.map.getZoom(), this.coordinateZoom) });
   }
 
   /** Load the land of the present scale, when the scale asks for another. */

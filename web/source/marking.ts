@@ -2,11 +2,13 @@
 
 import type { Feature, Position } from "geojson";
 import { register } from "./again";
+import { COORDINATE_ZOOM } from "./atlas";
 import { blobUrl, call, get } from "./api";
 import type { AdjustedMark, AdjustedMarks, PlaceOfMarks, PointWithViews, ResultFile, Scene, StatusInfo } from "./api_types";
 import { fill, h, plural, problem } from "./elements";
 import { type Begun, History, type InImage, type Mark, nothingBegun, type OnGround, parseInImage, parseOnGround, readCsv, type State, unlike, writeCsv } from "./marks";
 import { notesOn, StatedFields, verdictOn } from "./marks_accuracy";
+import { referenceChoice } from "./marks_reference";
 import { MarksTable } from "./marks_table";
 import { announce, go } from "./page";
 import { run, stateText } from "./processes";
@@ -53,6 +55,7 @@ export const showMarking: ShowView = async (place, id) => {
     section.remove();
     panel.after(map);
     document.body.classList.remove("marking");
+    atlas.coordinateZoom = COORDINATE_ZOOM;
     for (const layer of ["marks", "target", "scenes"] as const) void atlas.show(layer, []);
   });
   const marking = new Marking(place, scene, model, (finished) => new Viewer(section, tiles, finished, signal, OF_IMAGE));
@@ -77,8 +80,6 @@ class Marking {
   private next: PlaceOfMarks | null = null;
   private request = new AbortController();
   private outline: Position[] = [];
-  /** Zoom of the map at which its pixels are as large as those of the image. */
-  private zoom = 15;
 
   private readonly heading = h("h2");
   private readonly prompt = h("p", { class: "prompt", role: "status" });
@@ -136,10 +137,12 @@ class Marking {
     this.outline = places.filter(({ lon }) => lon != null).map(({ lon, lat }) => [lon!, lat!]);
     const [[lon, lat] = [NaN, NaN], [otherLon, otherLat] = [NaN, NaN]] = this.outline as [number, number][];
     const side_deg = Math.hypot((otherLon! - lon!) * Math.cos(radians(lat!)), otherLat! - lat!);
-    if (side_deg > 0) this.zoom = zoomOf(side_deg / samples, lat!);
+    if (side_deg > 0) atlas.coordinateZoom = zoomOf(side_deg / samples, lat!);
     const geometry = { type: "Polygon" as const, coordinates: [[...this.outline, ...this.outline.slice(0, 1)]] };
     await atlas.show("scenes", [{ type: "Feature", geometry, properties: { id: this.scene.id, name: this.scene.name } }]);
     atlas.fit(geometry);
+    const reference = await referenceChoice(atlas, this.outline, signal);
+    if (reference) this.chip.after(reference);
     this.refresh();
     await this.adjust();
   }
@@ -216,7 +219,7 @@ class Marking {
       this.put({ marks, begun: nothingBegun(marks) }, `${name} set.`);
       return;
     }
-    this.put({ marks: this.marks, begun }, image ? "Place in the image chosen." : "Place on the ground chosen.");
+    this.put({ marks: this.marks, begun }, half.image ? "Place in the image chosen." : half.ground?.point === undefined ? "Place on the ground chosen." : `Control point ${half.ground.point} chosen.`);
     if (image && ground) {
       this.ground.focus();
       this.ground.setSelectionRange(this.ground.value.length, this.ground.value.length);
@@ -237,7 +240,7 @@ class Marking {
       if (this.ground.value.trim() && this.ground.value !== groundText(ground)) half.ground = this.inside(parseOnGround(this.ground.value));
       if (!half.image && !half.ground) throw new Error(image && ground ? "A height is missing: add it after longitude and latitude." : "A place in the image or on the ground is missing.");
       this.choose(half);
-      if (half.ground) void this.place.atlas.goTo([half.ground.lon, half.ground.lat], this.zoom);
+      if (half.ground) void this.place.atlas.goTo([half.ground.lon, half.ground.lat]);
     } catch (error) {
       this.refuse(error);
     }
@@ -272,13 +275,13 @@ class Marking {
   /** Bring a mark into the middle of the image and of the map. */
   private look({ line, sample, lon, lat }: Mark): void {
     this.viewer.goTo({ at: pixel({ line, sample }), radius: AROUND_PX });
-    void this.place.atlas.goTo([lon, lat], this.zoom);
+    void this.place.atlas.goTo([lon, lat]);
   }
 
   private goOn(): void {
     if (this.next?.line == null || this.next.sample == null) return;
     this.viewer.goTo({ at: pixel({ line: this.next.line, sample: this.next.sample }), radius: AROUND_PX });
-    if (this.next.lon != null) void this.place.atlas.goTo([this.next.lon, this.next.lat!], this.zoom);
+    if (this.next.lon != null) void this.place.atlas.goTo([this.next.lon, this.next.lat!]);
     this.viewer.element.focus();
   }
 
@@ -384,7 +387,7 @@ class Marking {
     const { atlas } = this.place;
     if (this.begun.image) {
       if (lon == null || lat == null) return;
-      void atlas.goTo([lon, lat], this.zoom);
+      void atlas.goTo([lon, lat]);
       this.prompt.textContent = "Now the same place on the map: it is expected in the circle in its middle.";
       return;
     }

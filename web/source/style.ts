@@ -245,11 +245,12 @@ function layers(dark: boolean, colouring: Colouring): LayerSpecification[] {
       id: "marks",
       type: "circle",
       source: "marks",
+      // Hollow, so that what was marked is seen.
       paint: {
-        "circle-radius": 5,
-        "circle-color": ["match", ["get", "colour"], "rejected", c.active, "check", c.block, c.scene],
-        "circle-stroke-color": c.halo,
-        "circle-stroke-width": 1.5,
+        "circle-radius": 7,
+        "circle-color": "transparent",
+        "circle-stroke-color": ["match", ["get", "colour"], "rejected", c.active, "check", c.block, c.scene],
+        "circle-stroke-width": 3,
       },
     },
     {

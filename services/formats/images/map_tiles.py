@@ -14,8 +14,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from amers.services.errors import FormatError
+from amers.services.errors import CoverageError, FormatError
 from amers.services.formats.images.tiles import grey_values
+from amers.services.imagery.source import ImageSource, sample_image
+from amers.services.map_grid import MapGrid
 from amers.services.orthorectification.rectify import OrthoWindow
 from amers.services.orthorectification.tile_limits import TILE_PX, TileLimits, TilePlace
 
@@ -24,6 +26,10 @@ _RECORD = np.dtype([("position", "<u8"), ("size", "<u4")])
 _JPEG, _PNG = b"\xff\xd8", b"\x89PNG"
 _LARGEST_TILE_BYTES = 8 * TILE_PX**2
 """More than any tile has, whatever it shows."""
+
+MOST_REDUCED = 8
+"""Largest ratio of the pixels of a tile that is drawn on demand to those of its image, of which
+2048 x 2048 are then read."""
 
 Bytes = npt.NDArray[np.uint8]
 
@@ -97,6 +103,33 @@ def read_map_tile(
             return tile
         first += level.rows * level.columns
     return None
+
+
+def draw_map_tile(
+    image: ImageSource, grid: MapGrid, place: TilePlace, grey_range: tuple[float, float]
+) -> bytes:
+    """A tile of an ortho-image, from its pixels: JPEG, or PNG that is transparent beyond the image.
+
+    Args:
+        image: of the map grid; only its window under the tile is read.
+        grid: of its pixels.
+        place: of the tile; its pixels are at most `MOST_REDUCED` times larger than those of the image.
+        grey_range: values that become black and white.
+
+    Raises:
+        CoverageError: the pixels of the tile are larger.
+    """
+    of_tile = TileLimits(place.zoom, place.row, place.row, place.column, place.column).grid()
+    ratio = of_tile.gsd_m / grid.gsd_m
+    if ratio > MOST_REDUCED:
+        raise CoverageError(
+            f"zoom {place.zoom}: pixels {ratio:.0f} times larger than those of the image, at most "
+            f"{MOST_REDUCED} expected"
+        )
+    places = np.indices(of_tile.shape).reshape(2, -1).T.astype(np.float64)
+    line_sample = grid.line_sample(of_tile.lon_lat(places)).reshape(*of_tile.shape, 2)
+    pixels = sample_image(image, line_sample, ratio)
+    return _encoded(grey_values(pixels, *grey_range), (~np.isnan(pixels)).astype(np.uint8))
 
 
 def tile_media_type(tile: bytes) -> str:
