@@ -150,7 +150,7 @@ def test_the_accuracy_of_a_registered_scene_is_stated(inputs: list[object], tmp_
 def test_vertices_beyond_the_area_that_points_hold_have_no_accuracy(
     inputs: list[object], tmp_path: Path
 ) -> None:
-    """Points hold lines 0 to 200, but for a hole; the second line leaves them, the third point is in it."""
+    """Points hold lines 0 to 200, but for a hole: line 2 leaves them, point 3 is in the hole."""
     folder = registered(tmp_path / "a", in_the_image(), Frame.from_sigmas(3.0, 3.0))
     document = json.loads((folder / "correction.json").read_text())
     around = [[-0.5, -0.5], [-0.5, 399.5], [200.0, 399.5], [200.0, -0.5], [-0.5, -0.5]]
