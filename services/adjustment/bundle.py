@@ -19,7 +19,7 @@ from amers.services.adjustment.parameters import AdjustableImage, BlockPriors, b
 from amers.services.adjustment.reduced_system import DENSE_ROWS, ReducedSystem
 from amers.services.adjustment.robust_start import robust_start, started
 from amers.services.adjustment.settled_block import Round, Weighing, settled
-from amers.services.errors import InputError, NoConsensus
+from amers.services.errors import InputError, NoConsensus, UndeterminedCorrection
 from amers.services.sensors.base import SensorModel
 from amers.services.types import Array, BoolArray, Frame, IntArray, Observations
 
@@ -109,6 +109,8 @@ def adjust_block(
             points disagree.
         DisconnectedBlock: groups of images without common points, and without control of each.
         NoConvergence: the parameters still change after the last iteration.
+        UndeterminedCorrection: nothing determines the place of the block, such as one image on control
+            points whose frame is unknown.
     """
     tied = None if neighbour is None else tie(images, neighbour)
     common = np.zeros(len(images), dtype=np.bool_) if tied is None else tied.members(len(images))
@@ -117,9 +119,16 @@ def adjust_block(
     n_points = int(observations.point[-1]) + 1 if len(observations) else 0
     problem = BlockProblem(images, observations, control, options, n_points, priors.size, tied)
     _check_heights(problem)
-    start = _start(problem, priors, like)
-    _check_control(control, start.control_active)
-    return _stated(problem, settled(problem, start, once=like is not None), passes)
+    try:
+        start = _start(problem, priors, like)
+        _check_control(control, start.control_active)
+        return _stated(problem, settled(problem, start, once=like is not None), passes)
+    except np.linalg.LinAlgError:
+        raise UndeterminedCorrection(
+            f"{len(images)} images and {len(control)} control points leave the place of the block open: "
+            "state the common error of the control points on the Earth (--control-frame-sigma-m), or "
+            "add images or control points"
+        ) from None
 
 
 def _start(problem: BlockProblem, priors: BlockPriors, like: BlockAdjustment | None) -> Weighing:
