@@ -125,8 +125,10 @@ def refine(
             default the file has to state it.
         sigma_px: precision of marks that come without one, one standard deviation of each coordinate,
             pixels. By default 0.5.
-        order: of the correction: "shift" needs two marks, "drift" three, "affine" four, one more than
-            determine it. By default None: it is selected by cross-validation, which needs four.
+        order: of a correction by least squares alone: "shift" needs two marks, "drift" three, "affine"
+            four, one more than determine it. By default None: the marks are weighed against the accuracy
+            of the model, as by `register` with `control`: one mark is enough, and wrong ones are
+            rejected.
 
     Raises:
         InputError: a file cannot be used, or a latitude is beyond 90 degrees.

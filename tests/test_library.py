@@ -231,6 +231,19 @@ def test_the_correction_of_marks_is_that_which_was_put_in(world: FlatWorld):
     )
 
 
+def test_one_mark_shifts_a_model_and_a_wrong_one_is_rejected(scene: amers.Scene):
+    """Without an order, as registrations on marks do."""
+    seen = np.array([[90.0, 40.0], [450.0, 560.0], [70.0, 470.0], [500.0, 90.0], [300.0, 300.0]])
+    ground = amers.locate(scene, seen, GROUND_H)
+    moved = seen + [0.7, -0.3]
+    one = amers.refine(scene, (ground[:1], moved[:1]))
+    half_of_it_px = 0.35
+    assert np.abs(amers.project(one, ground) - moved).max() < half_of_it_px
+    moved[2] += 60.0
+    refinement = amers.refine(scene, (ground, moved))
+    assert np.flatnonzero(~refinement.adjustment.active).tolist() == [2]
+
+
 def test_results_need_a_folder_for_what_only_files_have(tmp_path: Path):
     for option in ({"check_points": "points.csv"}, {"copy_image": True}):
         with pytest.raises(amers.InputError, match="a folder for the results is expected"):

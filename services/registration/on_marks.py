@@ -47,11 +47,10 @@ def register_on_marks(
         CoverageError: no mark lies where the model of the scene is valid.
     """
     shape, gsd_m = scene.image.shape, scene_gsd_m(scene)
-    slope_px = min(options.adjustment.prior_slope_sigma_px, SLOPE * max(shape) / 2.0)
     observations = ControlObservations(
         marks.lon_lat_h, marks.line_sample, marks.sigma_px, marks.covariance_m2
     )
-    marked = adjust_marks(scene.model, shape, observations, MarkPriors(scene.sigma_m / gsd_m, slope_px))
+    marked = adjust_marks(scene.model, shape, observations, mark_priors(scene, options))
 
     def refit(used: BoolArray) -> SceneAdjustment:
         part = replace(observations, usable=used)
@@ -91,6 +90,17 @@ _NO_VIEWS = ViewMeasures(
     np.zeros(0, dtype=np.bool_),
     np.zeros(0, dtype=np.str_),
 )
+
+
+def mark_priors(scene: Scene, options: RegistrationOptions = RegistrationOptions()) -> MarkPriors:
+    """What is expected of the model of a scene before its marks are known.
+
+    Args:
+        scene: as delivered.
+        options: the a priori standard deviation of drift and skew.
+    """
+    slope_px = min(options.adjustment.prior_slope_sigma_px, SLOPE * max(scene.image.shape) / 2.0)
+    return MarkPriors(scene.sigma_m / scene_gsd_m(scene), slope_px)
 
 
 def _measures(scene: Scene, marks: SceneMarks, marked: MarkedScene) -> Measures:

@@ -13,8 +13,10 @@ from amers.services.imagery.scene import Scene
 from amers.services.misfit.affine_fit import FREE, Order
 from amers.services.misfit.control_observations import ControlObservations
 from amers.services.misfit.image_correction import adjust_scene
+from amers.services.misfit.marked_scene import adjust_marks
 from amers.services.misfit.scene_adjustment import AdjustmentOptions, SceneAdjustment
 from amers.services.quality.check_points import MARKING_SIGMA_PX, CheckPoints
+from amers.services.registration.on_marks import mark_priors
 from amers.services.sensors.correction import CorrectedModel
 from amers.services.statements import Statements, gathered
 
@@ -75,26 +77,32 @@ def refine_on_marks(scene: Scene, marks: CheckPoints, order: Order | None = None
         scene: as delivered.
         marks: known ground and where the image shows it. A mark without a sigma counts as 0.5 px, a
             ground point without one as exact.
-        order: of the correction: "shift" needs two marks, "drift" three, "affine" four, one more than
-            determine it. None selects it by cross-validation, and needs four.
+        order: of a correction by least squares alone, without an expectation of the model: "shift" needs
+            two marks, "drift" three, "affine" four, one more than determine it. None weighs the marks
+            against the accuracy of the model, as `register_on_marks`: one mark is enough, and wrong ones
+            are rejected.
 
     Raises:
         InputError: the order is none of these.
-        NotEnoughPoints: fewer marks have a position in the image.
+        NotEnoughPoints: fewer marks have a position in the image than the order needs.
+        CoverageError: no mark lies where the model of the scene is valid.
         UndeterminedCorrection: the marks lie on a line, which does not determine the order given.
     """
-    options = AdjustmentOptions()
-    if order is not None:
-        if order not in FREE:
-            raise InputError(f"order: {order} found, one of {', '.join(FREE)} expected")
-        options = replace(options, order=order, min_points=int(FREE[order].sum()) // 2 + 1)
+    if order is not None and order not in FREE:
+        raise InputError(f"order: {order} found, one of {', '.join(FREE)} expected")
     observations = ControlObservations(
         marks.lon_lat_h,
         marks.line_sample,
         np.nan_to_num(marks.sigma_px, nan=MARKING_SIGMA_PX),
         np.nan_to_num(marks.sigma_m)[:, None, :] ** 2 * np.eye(3),
     )
-    adjustment = adjust_scene(scene.model, scene.image.shape, observations, options)
+    shape = scene.image.shape
+    if order is None:
+        adjustment = adjust_marks(scene.model, shape, observations, mark_priors(scene)).adjustment
+    else:
+        fewest = int(FREE[order].sum()) // 2 + 1
+        options = AdjustmentOptions(order=order, min_points=fewest)
+        adjustment = adjust_scene(scene.model, shape, observations, options)
     statements = gathered(scene.statements + marks.statements)
     model = CorrectedModel(scene.model, adjustment.correction)
     return Refinement(model, adjustment, statements=statements)
