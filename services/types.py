@@ -92,10 +92,12 @@ class Frame:
         shared_m2: (3, 3) of what neighbouring points of the block are off by together, beyond its frame:
             deformations, by the errors of its images. It is part of the covariance of every point; zero
             where it is not stated.
+        how_to_state: what a user gives to state it; "" where nothing can be given.
     """
 
     covariance_m2: Array
     shared_m2: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    how_to_state: str = field(default="", compare=False)
 
     @classmethod
     def from_sigmas(cls, horizontal_m: float, up_m: float) -> Self:

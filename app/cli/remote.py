@@ -2,11 +2,13 @@
 
 import json
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from amers.app.client import Client, Job, JobFailed, ServiceFailure
 from amers.app.errors import AmersError, ComputationError, InputError
-from amers.app.usecases.registration.control_marks import MarkFiles
+from amers.app.usecases.marked_files import PointStatements
+from amers.app.usecases.registration.control_marks import MarkFiles, marks_as_opf
 from amers.app.usecases.registration.register import SceneFiles
 from amers.services import errors
 from amers.services.formats.images.scenes import model_files
@@ -50,12 +52,14 @@ def register(
     # The model is read to check it before anything is sent.
     models = model_files(files.image, files.model)
     image = files_to_send(files.image)[0]
-    of_marks = {} if marks is None else _inputs_of_marks(marks)
-    control = None if marks is None else marks.paths[0]
-    optional_files = [path for path in (files.mask, files.check_points, control) if path is not None]
-    upload_progress = part_of(progress, 0.0, UPLOAD_SHARE)
-    scene = client.upload_scene(image, sigma_m=files.sigma_m, progress=upload_progress)
-    names = {path: client.upload_file(scene, path) for path in [*models, *optional_files]}
+    with TemporaryDirectory(prefix="amers-") as scratch:
+        sent = None if marks is None else _to_send(marks, files, Path(scratch))
+        control = None if sent is None else sent.paths[0]
+        optional_files = [path for path in (files.mask, files.check_points, control) if path is not None]
+        upload_progress = part_of(progress, 0.0, UPLOAD_SHARE)
+        scene = client.upload_scene(image, sigma_m=files.sigma_m, progress=upload_progress)
+        names = {path: client.upload_file(scene, path) for path in [*models, *optional_files]}
+    of_marks = {} if sent is None else _inputs_of_marks(sent)
     paths = {
         "model": files.model,
         "mask": files.mask,
@@ -85,25 +89,31 @@ def register(
     return report
 
 
-def _inputs_of_marks(marks: MarkFiles) -> dict[str, Any]:
-    """The inputs of the process that state what a file of marks does not.
+def _to_send(marks: MarkFiles, files: SceneFiles, folder: Path) -> MarkFiles:
+    """The file of marks that a service can read: as given, or converted here by what was stated of it.
 
     Raises:
-        InputError: the service cannot be told so much.
+        InputError: the marks cannot be read, or a sigma of marks to convert is not stated.
     """
+    stated = marks.points.stated
+    needs_us = isinstance(stated.heights, Path) or stated.csv.crs or stated.csv.columns
+    if not (needs_us or stated.sigma_axes or marks.terrain or len(marks.paths) > 1):
+        return marks
+    scene = files.read()
+    try:
+        text = marks_as_opf(marks, files.image, scene)
+    finally:
+        scene.image.close()  # type: ignore[attr-defined]
+    path = folder / f"{marks.paths[0].stem}.opf.json"
+    path.write_text(text, encoding="utf-8")
+    return MarkFiles((path,), PointStatements(frame_sigma_m=marks.points.frame_sigma_m))
+
+
+def _inputs_of_marks(marks: MarkFiles) -> dict[str, Any]:
+    """The inputs of the process that state what a file of marks does not."""
     points = marks.points
-    if len(marks.paths) > 1:
-        raise InputError(f"--control: {len(marks.paths)} files found; a service takes one of a scene")
-    if marks.terrain is not None:
-        raise InputError("--server: a service takes no --control-dem: state the heights of the marks")
-    heights = points.stated.heights
-    if isinstance(heights, Path) or points.stated.csv.crs or points.stated.csv.columns:
-        raise InputError(
-            "--server: state the heights of marks with --control-vertical, and give longitude and "
-            "latitude; leave out --control-geoid, --control-crs and --control-columns"
-        )
     inputs = {
-        "control_heights": heights,
+        "control_heights": points.stated.heights,
         "control_sigma_m": points.sigma_m,
         "control_frame_sigma_m": points.frame_sigma_m,
         "control_mark_sigma_px": points.mark_sigma_px,

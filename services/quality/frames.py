@@ -62,10 +62,8 @@ def frame_in_image(frame: Frame, derivative: Array, apart_px: float) -> Array:
 def why_unknown(frame: Frame) -> str:
     """Which part of the accuracy of a frame is not stated; "" when all of it is."""
     unknown = np.isnan(np.diagonal(frame.covariance_m2))
-    if unknown.all():
-        return "the accuracy of the control points' frame is not stated"
-    if unknown[2]:
-        return "the height accuracy of the control points' frame is not stated"
-    if unknown.any():
-        return "the horizontal accuracy of the control points' frame is not stated"
-    return ""
+    if not unknown.any():
+        return ""
+    part = "" if unknown.all() else "height " if unknown[2] else "horizontal "
+    how = f"; give {frame.how_to_state}" if frame.how_to_state else ""
+    return f"the {part}accuracy of the control points' frame is not stated{how}"

@@ -80,6 +80,23 @@ def test_two_marks_and_ties_place_a_scene_beside_one_with_six(
     assert report["run"]["blocks"] == [{"id": "marks.csv", "version": "marks"}]
 
 
+def test_check_points_are_reported_with_their_scene(
+    world: FlatWorld, images: list[Path], tmp_path: Path
+) -> None:
+    marks = write_marks(tmp_path / "marks.csv", world, {"east": 6, "south": 5})
+    origin, head, *rows = marks.read_text().splitlines()
+    held_out = [f"{row},{int(row.startswith(('GCP3,', 'GCP4,')))}" for row in rows]
+    marks.write_text("\n".join([origin, f"{head},check", *held_out]))
+    ended = register(images, tmp_path / "out", "--control", marks)
+    assert ended.returncode == 0, ended.stderr
+    for image in images:
+        report = json.loads((tmp_path / "out" / image.stem / "report.json").read_text())
+        (check,) = report["checks"]
+        assert check["against"] == "independent check points of marks.csv"
+        assert check["accuracy"]["n"] == 2
+        assert not {"GCP3", "GCP4"} & set(statuses(tmp_path / "out", image.stem))
+
+
 def test_a_scene_without_marks_says_what_ties_leave_open(
     world: FlatWorld, images: list[Path], tmp_path: Path
 ) -> None:

@@ -10,8 +10,13 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
+from amers.app.usecases.registration.control_marks import MarkFiles, marks_as_opf
+from amers.app.usecases.terrain_file import TerrainFile
+from amers.services.formats.gcp.reader import read_control_points
 from amers.services.formats.images.raster import write_raster
+from amers.services.formats.images.scenes import read_scene
 from amers.services.formats.sensor_models.rpc_files import read_rpc
+from amers.services.map_grid import utm_of, xy_of_lon_lat
 from tests.command_line import Done, amers_here
 from tests.services.simulated import ring_of_geometries
 
@@ -117,6 +122,7 @@ def test_one_mark_is_enough(image):
     ended = register(image, "--control", write_marks(image.parent / "marks.csv", count=1))
     assert ended.returncode == 0, ended.stderr
     assert "A single mark is used, and nothing checks it" in ended.stdout
+    assert "is not stated; give --control-frame-sigma-m HORIZONTAL,UP" in ended.stdout
 
 
 def test_several_files_are_one_set_of_marks(image):
@@ -134,15 +140,53 @@ def test_several_files_are_one_set_of_marks(image):
         (["--control-sigma-m", "3,5"], "--control-sigma-m: of --control, which is missing; add it"),
         (
             ["--control", "MARKS", "--server", "http://localhost", "--control-crs", "EPSG:32631"],
-            "--server: state the heights of marks with --control-vertical, and give longitude and",
+            "the file has lon and lat, degrees of WGS 84; leave --control-crs out",
+        ),
+        (
+            ["--control", "UNSURE", "--control", "MARKS", "--server", "http://localhost"],
+            "unsure.csv: marks that are converted for a service need all their sigmas: state those of",
         ),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(image, words, said):
-    marks = write_marks(image.parent / "marks.csv")
-    ended = register(image, *(marks if word == "MARKS" else word for word in words))
+    files = {
+        "MARKS": write_marks(image.parent / "marks.csv"),
+        "UNSURE": write_marks(image.parent / "unsure.csv", head=HEAD, extra=""),
+    }
+    ended = register(image, *(files.get(word, word) for word in words))
     assert ended.returncode == 2
     assert said in ended.stderr
+
+
+def test_marks_on_a_map_and_a_terrain_are_sent_as_longitude_latitude_and_height(image):
+    """A service is sent what this machine has worked out; check points stay check points."""
+    columns = "id,image,x,y,line,sample,sigma_horizontal_m,sigma_px,check"
+    scene = read_scene(image, sigma_m=5.0)
+    picked = np.array([[100.0, 100.0], [300.0, 500.0], [500.0, 200.0]])
+    ground = TRUE.locate(picked, np.full(3, 120.0))
+    crs = utm_of(*ground[0, :2])
+    rows = [
+        f"GCP{k},view.tif,{x!r},{y!r},{line!r},{sample!r},0.1,0.3,{int(k == 2)}"
+        for k, ((x, y), (line, sample)) in enumerate(
+            zip(xy_of_lon_lat(crs, ground[:, :2]).tolist(), picked.tolist(), strict=True)
+        )
+    ]
+    path = image.parent / "map.csv"
+    path.write_text("\n".join([f"# pixel-origin=centre crs={crs}", columns, *rows]))
+    dem = image.parent / "dem.tif"
+    west, south = ground[:, :2].min(axis=0) - 0.01
+    place = from_origin(west, south + 0.03, 0.001, 0.001)
+    with rasterio.open(dem, "w", "GTiff", 30, 30, 1, "EPSG:4326", place, "float32") as file:
+        file.write(np.full((30, 30), 120.0, np.float32), 1)
+    marks = MarkFiles((path,), terrain=TerrainFile(dem, "ellipsoid"), terrain_sigma_m=0.2)
+    sent = image.parent / "sent.json"
+    sent.write_text(marks_as_opf(marks, image, scene))
+    read = read_control_points(sent)
+    scene.image.close()  # type: ignore[attr-defined]
+    assert np.allclose(read.lon_lat_h, ground, rtol=0.0, atol=[1e-9, 1e-9, 1e-3])
+    assert np.allclose(read.line_sample, picked)
+    assert read.check.tolist() == [False, False, True]
+    assert np.allclose(read.sigma_m, [[0.1, 0.1, 0.2]] * 3)
 
 
 def test_marks_of_other_images_are_refused_by_their_names(image):

@@ -14,13 +14,16 @@ from amers.app.usecases.registration.check_points import ground_positions, marks
 from amers.app.usecases.terrain_file import TerrainFile, read_terrain
 from amers.services.datums import filled_sigmas
 from amers.services.errors import refuse_unstated
-from amers.services.formats.gcp.marked_points import MarkedPoints
+from amers.services.formats.gcp.json_formats import format_opf
+from amers.services.formats.gcp.marked_points import MarkedPoints, joined_marks
 from amers.services.formats.gcp.reader import read_marked_ground, read_or_missing
 from amers.services.imagery.scene import Scene, scene_gsd_m
 from amers.services.quality.check_points import MARKING_SIGMA_PX, CheckPoints
 from amers.services.registration.scene_marks import SceneMarks
 from amers.services.statements import Statement, Statements, Subject, Use, gathered
 from amers.services.types import Frame
+
+_FRAME_OPTION = "--control-frame-sigma-m HORIZONTAL,UP, e.g. 0.05,0.05 for GNSS"
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,11 @@ def read_control_marks(
         InputError: a file cannot be used, does not state its heights, or has no mark of this scene; all
             marks are check points; a point is marked twice.
     """
+    return marks_to_adjust(_read(files), files, image, scene, may_lack=may_lack)
+
+
+def _read(files: MarkFiles) -> list[tuple[Path, MarkedPoints]]:
+    """The marks of every file that are switched on."""
     read, unstated = [], []
     for path in files.paths:
         marks, missing = read_or_missing(read_marked_ground, path, files.points.stated)
@@ -87,7 +95,40 @@ def read_control_marks(
             raise InputError(f"{path.name}: none of its marks is switched on; switch some on")
         read.append((path, marks))
     refuse_unstated(unstated)
-    return marks_to_adjust(read, files, image, scene, may_lack=may_lack)
+    return read
+
+
+def marks_as_opf(files: MarkFiles, image: Path, scene: Scene) -> str:
+    """The marks of a scene as one OPF document, which states longitude, latitude and ellipsoid heights.
+
+    Args:
+        files: of the marks.
+        image: of the scene; marks in other images are left out.
+        scene: of the image.
+
+    Raises:
+        InputError: as `read_control_marks`, or a sigma is not stated.
+    """
+    parts = []
+    read = _read(files)
+    for path, marks in read:
+        taken, points = marks_in_image(marks, path, image, scene), files.points
+        if points.sigma_m is not None:
+            filled = filled_sigmas(taken.sigma_m, points.sigma_m, taken.datum_sigma_m)
+            taken = replace(taken, sigma_m=filled)
+        if points.mark_sigma_px is not None:
+            taken = replace(taken, sigma_px=np.nan_to_num(taken.sigma_px, nan=points.mark_sigma_px))
+        taken = _on_terrain(taken, path, files)
+        if np.isnan(taken.sigma_m).any() or np.isnan(taken.sigma_px).any():
+            raise InputError(
+                f"{path.name}: marks that are converted for a service need all their sigmas: state "
+                "those of their ground (--control-sigma-m HORIZONTAL,UP) and of the marks "
+                "(--control-mark-sigma-px)"
+            )
+        ids = [f"{path.name}:{name}" for name in taken.id.tolist()] if len(read) > 1 else taken.id
+        ground = ground_positions(taken, path, scene)
+        parts.append(replace(taken, id=np.array(ids, dtype=np.str_), lon_lat_h=ground))
+    return format_opf(joined_marks(parts))
 
 
 def marks_to_adjust(
@@ -145,7 +186,7 @@ def marks_to_adjust(
             line_sample=line_sample[control],
             sigma_m=sigma_m[control],
             sigma_px=sigma_px[control],
-            frame=Frame.from_sigmas(*frame_m),
+            frame=replace(Frame.from_sigmas(*frame_m), how_to_state=_FRAME_OPTION),
             statements=statements,
         ),
         CheckPoints(lon_lat_h[rows], line_sample[rows], sigma_m[rows], sigma_px[rows])
@@ -154,10 +195,8 @@ def marks_to_adjust(
     )
 
 
-def read_marks_together(files: MarkFiles, scenes: Sequence[tuple[Path, Scene]]) -> list[SceneMarks]:
+def read_marks_together(files: MarkFiles, scenes: Sequence[tuple[Path, Scene]]) -> list[MarksOfScene]:
     """The marks of several scenes, none in some of them; those of one name are one point.
-
-    Marks that their files hold out are not used.
 
     Args:
         files: of the marks.
@@ -166,15 +205,16 @@ def read_marks_together(files: MarkFiles, scenes: Sequence[tuple[Path, Scene]]) 
     Raises:
         InputError: as `read_control_marks`; or no scene has a mark.
     """
-    every = [read_control_marks(files, image, scene, may_lack=True).control for image, scene in scenes]
-    names = dict.fromkeys(name for marks in every for name in marks.names)
+    every = [read_control_marks(files, image, scene, may_lack=True) for image, scene in scenes]
+    names = dict.fromkeys(name for marks in every for name in marks.control.names)
     if not names:
         raise InputError(f"{files.name}: expected marks in one of {len(scenes)} images, found none")
-    number = {name: -(k + 1) for k, name in enumerate(names)}
-    return [
-        replace(marks, number=np.array([number[name] for name in marks.names], dtype=np.int64))
-        for marks in every
-    ]
+    row = {name: -(k + 1) for k, name in enumerate(names)}
+
+    def numbered(marks: SceneMarks) -> SceneMarks:
+        return replace(marks, number=np.array([row[name] for name in marks.names], dtype=np.int64))
+
+    return [replace(marks, control=numbered(marks.control)) for marks in every]
 
 
 def _completed(

@@ -190,7 +190,7 @@ def _register_and_write(
 
     checks: tuple[Check, ...] = ()
     for name, points in held_out:
-        registration, check = _check(registration, points, attempt.options, name)
+        registration, check = checked(registration, points, attempt.options, name)
         checks += (check,)
 
     progress(0.9, "writing the report")
@@ -362,21 +362,28 @@ def _register(
     return registration, reference
 
 
-def _check(
+def checked(
     registration: Registration,
     points: CheckPoints,
     options: RegistrationOptions,
     name: str,
 ) -> tuple[Registration, Check]:
-    """The registration, qualified with check points too, and its accuracy at these points."""
-    checked = check_model(registration.model, registration.adjustment, points, registration.frame)
+    """The registration, qualified with check points too, and its accuracy at these points.
+
+    Args:
+        registration: of the scene.
+        points: that had no part in it.
+        options: of the registration.
+        name: of the file of the points.
+    """
+    at_points = check_model(registration.model, registration.adjustment, points, registration.frame)
     limit = options.qualification.good_unit_weight
-    qualification = with_check_points(registration.qualification, checked, limit)
+    qualification = with_check_points(registration.qualification, at_points, limit)
     check = Check(
         f"independent check points of {name}",
-        checked.accuracy,
-        checked.residual_px,
-        checked.normalised,
+        at_points.accuracy,
+        at_points.residual_px,
+        at_points.normalised,
     )
     return replace(registration, qualification=qualification), check
 

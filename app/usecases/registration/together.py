@@ -23,6 +23,7 @@ from amers.app.usecases.registration.joined_scenes import (
 from amers.app.usecases.registration.register import (
     RegisteredScene,
     SceneFiles,
+    checked,
     grown,
     write_registered,
 )
@@ -32,10 +33,12 @@ from amers.services.errors import AmersError, InputError
 from amers.services.formats.adjusted_images import write_adjusted_images
 from amers.services.imagery.scene import Scene, scene_footprint
 from amers.services.joint.registration import AdjustedScenes, JointRegistration, register_together
+from amers.services.quality.check_points import CheckPoints
 from amers.services.registration.options import RegistrationOptions
 from amers.services.registration.scene_marks import SceneMarks, with_marks
 from amers.services.reports.joint import JointReport, joint_report
 from amers.services.reports.joint_pages import JOINT_PAGE
+from amers.services.reports.report import Check
 from amers.services.sensors.pushbroom import PushbroomModel
 from amers.services.tasks import Work
 from amers.services.types import Array, Progress, no_progress, part_of
@@ -150,6 +153,7 @@ class _Scenes:
         before: scenes that were registered before.
         opened: those that could be read.
         failed: why others were not registered, by the name of their folder.
+        held_out: marks that their files hold out, by the name of the folder of their scene.
     """
 
     place: JointPlace
@@ -157,6 +161,7 @@ class _Scenes:
     before: Sequence[_Read]
     opened: list[_Read] = field(default_factory=list)
     failed: dict[str, AmersError] = field(default_factory=dict)
+    held_out: dict[str, CheckPoints] = field(default_factory=dict)
 
     def read(self, files: Mapping[str, SceneFiles], stack: ExitStack) -> None:
         """Read the scenes, which stay open until the stack closes; note those that cannot be read.
@@ -223,7 +228,13 @@ def _register(
 
 def _marks(scenes: _Scenes, files: MarkFiles, control: ControlSet) -> list[SceneMarks]:
     """The marks of each scene, which its attempt notes beside the points of the base."""
-    every = read_marks_together(files, [(one.files.image, one.scene) for one in scenes.opened])
+    read = read_marks_together(files, [(one.files.image, one.scene) for one in scenes.opened])
+    scenes.held_out = {
+        one.folder: marks.check
+        for one, marks in zip(scenes.opened, read, strict=True)
+        if marks.check is not None
+    }
+    every = [marks.control for marks in read]
     for one, own in zip(scenes.opened, every, strict=True):
         attempt = scenes.attempts[one.folder]
         attempt.control = replace(control, points=with_marks(control.points, own))
@@ -246,12 +257,21 @@ def _write(
     for k, number in enumerate(result.numbers):
         progress(0.85 + 0.15 * k / len(result.numbers), "writing the reports")
         one = by_name[result.block.scenes[number].name]
+        attempt = scenes.attempts[one.folder]
+        checks: tuple[Check, ...] = ()
+        registration = result.registrations[k]
+        if one.folder in scenes.held_out:
+            registration, check = checked(
+                registration, scenes.held_out[one.folder], attempt.options, attempt.marks
+            )
+            checks = (check,)
         registered[one.folder] = write_registered(
             one.files,
-            result.registrations[k],
-            scenes.attempts[one.folder],
+            registration,
+            attempt,
             place.folder_of(one.folder),
             copy_image=copy_image,
+            checks=checks,
             rigorous=result.rigorous[k],
         )
     reports = [one.report for one in registered.values()]

@@ -19,7 +19,8 @@ Only the readers and writers of these formats convert: everywhere else the centr
 """
 
 import re
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +110,16 @@ class Ground:
 
     def __len__(self) -> int:
         return len(self.lon_lat_h)
+
+
+def joined_marks(parts: Sequence[MarkedPoints]) -> MarkedPoints:
+    """The marks of several files, one after the other; what the files state is left out."""
+    columns: dict[str, Any] = {
+        field.name: np.concatenate([getattr(part, field.name) for part in parts])
+        for field in fields(MarkedPoints)
+        if field.name not in ("statements", "datum_sigma_m")
+    }
+    return MarkedPoints(**columns)
 
 
 def marked_points(
