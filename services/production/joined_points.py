@@ -15,6 +15,7 @@ from amers.services.matching.multi_image import chip_inside, nearly_whole
 from amers.services.production.ortho_production import GroundHeights, OrthoPoints
 from amers.services.types import Acquisition, Array, ChipArray, ControlPoints, Frame, IntArray, Views
 
+_LEAST_IMAGES = 2
 _LATEST = 2
 """Latest images that must contradict a point."""
 
@@ -83,9 +84,9 @@ def joined_points(
 
 
 def still_found(production: OrthoPoints, latest: Sequence[Scene]) -> IntArray:
-    """Rows (n,) of the points that the latest images do not contradict.
+    """Rows (n,) of the points that two images show at least, and that the latest ones do not contradict.
 
-    A point has vanished where two or more of them show its whole chip, and it was found in none.
+    A point has vanished where two or more of the latest show its whole chip, and it was found in none.
 
     Args:
         production: of the latest and earlier images.
@@ -95,6 +96,8 @@ def still_found(production: OrthoPoints, latest: Sequence[Scene]) -> IntArray:
     of_view = np.repeat(np.arange(len(points)), np.diff(points.views.start))
     shown = np.zeros(len(points), dtype=np.int64)
     found = np.zeros(len(points), dtype=np.bool_)
+    pairs = np.unique(np.column_stack([of_view, points.views.image]), axis=0)
+    images = np.bincount(pairs[:, 0], minlength=len(points))
     gsd_m = production.gsds_m[0]
     for scene in latest:
         whole = chip_inside(scene.model, scene.image.shape, points.lon_lat_h, gsd_m)
@@ -105,7 +108,7 @@ def still_found(production: OrthoPoints, latest: Sequence[Scene]) -> IntArray:
         if scene.acquisition.image_id in names:
             image = names.index(scene.acquisition.image_id)
             found[of_view[points.views.image == image]] = True
-    return np.flatnonzero(found | (shown < _LATEST))
+    return np.flatnonzero((images >= _LEAST_IMAGES) & (found | (shown < _LATEST)))
 
 
 def _far_from(lon_lat_h: Array, placed: Array, least_m: float) -> IntArray:

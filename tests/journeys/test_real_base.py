@@ -77,6 +77,18 @@ def test_the_base_of_berlin_states_that_its_dates_lie_18_m_apart(
     assert made["sigma_m"] >= made["dates_apart_m"] / 2.0 / np.sqrt(2.0)
     document = json.loads((block / "block.json").read_text())
     assert "Copernicus Sentinel data 2016" in json.dumps(document)
+    site = ["--site", june, "--site-sigma-m", "1", "--search-m", "40"]
+    quality = amers("block", "quality", block, *site, "--points-per-km2", "0.001", "-o", tmp_path / "q")
+    (group,) = quality["planimetry"][0]["groups"]
+    print(group["accuracy"])
+    # The June image lies off the frame of both by half of their distance.
+    np.testing.assert_allclose(group["accuracy"]["bias_m"], MAY_OFF_M / 2.0, atol=ALLOWED_M)
+    assert group["accuracy"]["ce90_m"]["value"] < made["on_the_earth"]["ce90_m"]
+    assert amers("block", "ingest", block, "--publish")["block"]["points"] == made["points"]
+    shown = amers("block", "show", "berlin")
+    assert shown["state"] == "published"
+    assert shown["title"] == "berlin. Contains modified Copernicus Sentinel data 2016"
+    assert shown["on_the_earth"]["ce90_m"] == pytest.approx(made["on_the_earth"]["ce90_m"], rel=0.01)
     for scene, sign in ((june, 1.0), (may, -1.0)):
         result = amers("scene", "register", scene, "--block", block, "-o", tmp_path / scene.stem)
         line_px, sample_px = result["shift_px"]

@@ -292,7 +292,7 @@ def _metadata(
         ),
         outline=box_around(points.lon_lat_h),
         specification=BlockSpecification(
-            gsds_m, fewest_views(points), points_per_km2(spacing_m(making.options, archive))
+            gsds_m, fewest_views(points), points_per_km2(making.options.spacing_m)
         ),
         options={
             **asdict(making.options),
