@@ -44,6 +44,8 @@ from tests.factories import make_block
 Words = tuple[object, ...]
 BOX = ",".join(f"{value:.4f}" for value in (*(CENTRE - 0.1), *(CENTRE + 0.1)))
 WITHOUT_STORE = {
+    "base make",
+    "base update",
     "scene mosaic",
     "points experiment",
     "points intersect",
