@@ -81,6 +81,9 @@ def write_files(folder: Path, drawn: Draw) -> list[str]:
     count = len(drawn.known) - TIES
     points = np.flatnonzero(drawn.shown.all(axis=1))
     marks = marked(drawn, ALL, points, MARK_M)
+    half = np.array(SHAPE) / 2.0
+    outside = (np.abs(marks.line_sample + 0.5 - half) > half).any(axis=1)
+    marks = marks.take(~np.isin(marks.point, marks.point[outside]))
     with (folder / "marks.csv").open("w", newline="") as file:
         file.write("# pixel-origin=centre heights=ellipsoid\n")
         rows = csv.writer(file)
