@@ -98,7 +98,8 @@ class ControlOptions:
         control_crs: reference system of x and y of a CSV, such as EPSG:32633.
         control_columns: columns of a CSV of other names: lon=COLUMN,lat=COLUMN,…
         control_sigma_axes: axes of the sigmas of an ASP file: ecef or lat-lon-height.
-        control_ortho: ortho-image that places the block east and north; repeat for several.
+        control_ortho: ortho-image that places the block east and north: a file, or a folder, archive,
+            .vrt, .txt list or STAC catalogue of its pieces; path or address; repeat for others.
         control_ortho_sigma_m: accuracy of --control-ortho on the Earth, one sigma a coordinate, metres;
             by default that of the product.
         control_dem: heights of the ground that places the block in height: a file, folder, archive, .txt
@@ -118,7 +119,7 @@ class ControlOptions:
     control_crs: str | None = None
     control_columns: str | None = None
     control_sigma_axes: str | None = None
-    control_ortho: tuple[Path, ...] = ()
+    control_ortho: Places = ()
     control_ortho_sigma_m: FromMilli = None
     control_dem: Places = ()
     control_dem_vertical: str | None = None
@@ -137,7 +138,7 @@ class ControlOptions:
         return ControlFiles(
             self.control,
             _point_statements(self),
-            orthos=self.control_ortho,
+            orthos=tuple(source_of([place]) for place in self.control_ortho),
             ortho_sigma_m=self.control_ortho_sigma_m,
             heights=self._heights(),
             neighbour=neighbour,

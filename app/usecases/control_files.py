@@ -13,12 +13,15 @@ from amers.app.usecases.registration.reference_source import COMMON_SIGMA_PX, LO
 from amers.app.usecases.terrain_file import TerrainFile, read_terrain
 from amers.services.adjustment.known_images import KnownImages
 from amers.services.errors import VerticalDatumError
-from amers.services.formats.addresses import FilePlace
+from amers.services.formats.addresses import FilePlace, file_bytes
 from amers.services.formats.adjusted_images import read_adjusted_images
 from amers.services.formats.block.document_json import BLOCK_JSON
 from amers.services.formats.block.reader import FolderChips, file_sha256, read_block
+from amers.services.formats.images.mosaic import open_mosaic
 from amers.services.formats.images.scenes import product_sigma_m, read_scene
+from amers.services.formats.pieces import IMAGES, Source, pieces_of
 from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import ImageSource
 from amers.services.matching.reference_image import Reference
 from amers.services.production.control import Control
 from amers.services.production.control_points import ControlBlock
@@ -54,7 +57,7 @@ class ControlFiles:
     Attributes:
         paths: folders of older blocks, and files of ground points marked in the images.
         points: what the files of points do not state.
-        orthos: ortho-images, which tell positions.
+        orthos: ortho-images, which tell positions: files, or what has their pieces.
         ortho_sigma_m: accuracy of them on the Earth, one standard deviation a coordinate; by default
             that of their product.
         heights: an elevation model, which tells heights.
@@ -63,7 +66,7 @@ class ControlFiles:
 
     paths: tuple[Path, ...] = ()
     points: PointStatements = field(default_factory=PointStatements)
-    orthos: tuple[Path, ...] = ()
+    orthos: tuple[Source, ...] = ()
     ortho_sigma_m: float | None = None
     heights: HeightFile | None = None
     neighbour: Path | None = None
@@ -114,11 +117,19 @@ def control_inputs(files: ControlFiles) -> dict[str, Any]:
             for path in files.paths
         ],
         "points": asdict(files.points),
-        "orthos": [{"path": str(path.resolve()), "sha256": file_sha256(path)} for path in files.orthos],
+        "orthos": [_pieces_facts(source) for source in files.orthos],
         "ortho_sigma_m": files.ortho_sigma_m,
         "heights": None if files.heights is None else asdict(files.heights),
         "neighbour": None if files.neighbour is None else file_sha256(files.neighbour / IMAGES_NPZ),
     }
+
+
+def _pieces_facts(source: Source) -> dict[str, Any]:
+    """What identifies an ortho-image: the content of its file, or the pieces that have it."""
+    if isinstance(source, Path) and source.is_file():
+        return {"path": str(source.resolve()), "sha256": file_sha256(source)}
+    pieces = [(str(place), file_bytes(place)) for place in pieces_of(source, IMAGES)]
+    return {"path": str(source), "pieces": pieces}
 
 
 def _neighbour(folder: Path, blocks: Sequence[ControlBlock]) -> KnownImages:
@@ -137,31 +148,37 @@ def _block(folder: Path, stack: ExitStack) -> ControlBlock:
     return ControlBlock(contents.document.metadata.id, contents.points, chips)
 
 
-def _ortho(path: Path, sigma_m: float | None, stack: ExitStack) -> ControlOrtho:
-    scene = read_scene(path, sigma_m=math.nan)
+def _ortho(source: Source, sigma_m: float | None, stack: ExitStack) -> ControlOrtho:
+    pieces = pieces_of(source, IMAGES)
+    scene = read_scene(pieces[0], sigma_m=math.nan)
     stack.callback(scene.image.close)  # type: ignore[attr-defined]
     if not isinstance(scene.model, OrthoModel):
         raise InputError(
-            f"{path}: expected an ortho-image on a map (--control-ortho), found an image with a sensor "
-            "model; give it with --images"
+            f"{pieces[0]}: expected an ortho-image on a map (--control-ortho), found an image with a "
+            "sensor model; give it with --images"
         )
     stated_m = sigma_m or product_sigma_m(scene.acquisition.sensor)
     if stated_m is None:
         raise InputError(
-            f"{path}: the accuracy of this ortho-image on the Earth is not stated: give it with "
+            f"{source}: the accuracy of this ortho-image on the Earth is not stated: give it with "
             "--control-ortho-sigma-m, one standard deviation of each coordinate in metres"
         )
-    gsd_m = scene.model.grid.gsd_m
+    image: ImageSource = scene.image
+    grid, statements = scene.model.grid, scene.statements
+    if len(pieces) > 1:
+        mosaic = open_mosaic(pieces)
+        stack.callback(mosaic.close)
+        image, grid, statements = mosaic, mosaic.grid, mosaic.statements
     reference = Reference(
-        image=scene.image,
-        model=scene.model,
+        image=image,
+        model=OrthoModel(grid),
         terrain=None,
-        sigma_m=LOCAL_SIGMA_PX * gsd_m,
-        common_sigma_m=COMMON_SIGMA_PX * gsd_m,
+        sigma_m=LOCAL_SIGMA_PX * grid.gsd_m,
+        common_sigma_m=COMMON_SIGMA_PX * grid.gsd_m,
         frame=Frame.from_sigmas(stated_m, math.nan),
-        statements=scene.statements,
+        statements=statements,
     )
-    return ControlOrtho(path.name, reference)
+    return ControlOrtho(source.name, reference)
 
 
 def _heights(heights: HeightFile) -> ControlHeights:

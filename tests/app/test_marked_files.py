@@ -9,7 +9,7 @@ import pytest
 import rasterio
 
 from amers.app.errors import InputError
-from amers.app.usecases.control_files import ControlFiles, HeightFile, read_control
+from amers.app.usecases.control_files import ControlFiles, HeightFile, control_inputs, read_control
 from amers.app.usecases.marked_files import PointStatements, read_marked
 from amers.app.usecases.terrain_file import TerrainFile
 from amers.services.errors import FormatError, VerticalDatumError
@@ -200,6 +200,19 @@ def test_the_accuracy_of_an_ortho_image_is_that_of_its_product_or_stated(tmp_pat
     stated = control_of(ControlFiles(orthos=(unknown,), ortho_sigma_m=2.0)).orthos[0]
     assert stated.reference.frame.sigma_m == 2.0
     assert np.isnan(stated.reference.frame.sigma_up_m)
+
+
+def test_the_pieces_of_an_ortho_image_are_one_control(tmp_path: Path) -> None:
+    (tmp_path / "tiles").mkdir()
+    first = map_file(tmp_path / "tiles", "a_B04.tif")
+    second = map_file(tmp_path / "tiles", "b_B04.tif")
+    with rasterio.open(second, "r+") as raster:
+        raster.transform = rasterio.Affine(10.0, 0.0, 500200.0, 0.0, -10.0, 5000000.0)
+    files = ControlFiles(orthos=(tmp_path / "tiles",), ortho_sigma_m=2.0)
+    (ortho,) = control_of(files).orthos
+    assert (ortho.name, ortho.reference.image.shape) == ("tiles", (20, 40))
+    (facts,) = control_inputs(files)["orthos"]
+    assert [Path(path) for path, _ in facts["pieces"]] == [first, second]
 
 
 @pytest.mark.parametrize(
