@@ -44,6 +44,7 @@ class Place:
         gsd_m: range of the scenes' ground samplings.
         lines: of a scene, and its samples.
         points: along a side of the world.
+        centre_lon_lat: of the world, degrees.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Place:
     gsd_m: tuple[float, float]
     lines: int
     points: int
+    centre_lon_lat: tuple[float, float] = (5.4, 43.6)
 
 
 PLACES = tuple(
@@ -97,6 +99,7 @@ def world_of(place: Place) -> World:
         place.size_m,
         place.posting_m,
         place.relief_m,
+        centre_lon_lat=place.centre_lon_lat,
         smallest_hill_m=smallest_hill_m(place),
         patterned_share=place.patterned_share,
     )

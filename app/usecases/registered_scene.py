@@ -20,6 +20,7 @@ from amers.services.imagery.scene import Scene
 from amers.services.quality.correction_accuracy import CorrectionAccuracy
 from amers.services.sensors.correction import CorrectedModel, ImageCorrection
 from amers.services.sensors.ortho import OrthoModel
+from amers.services.sensors.parameter_sets import SRP, ParameterSet
 
 REFINED_NAME = "refined_RPC.TXT"
 """Name of the refined model among the outputs of a registration."""
@@ -79,7 +80,8 @@ def registered_scene(
         scene = _scene(ImageFiles(source.image, refined, (0.0, 0.0)), bands)
         _check_size(folder, scene)
         return scene, accuracy
-    scene = _scene(source, bands)
+    # Which of the published sets does not matter: only what is kept of the metadata does.
+    scene = _scene(source, bands, SRP if _is_of_rigorous(folder) else None)
     _check_size(folder, scene)
     return replace(scene, model=CorrectedModel(scene.model, accuracy.correction)), accuracy
 
@@ -149,9 +151,17 @@ def _read_accuracy(folder: Path) -> CorrectionAccuracy:
     return parse_correction_accuracy(read_text(path), str(path))
 
 
-def _scene(source: ImageFiles, bands: BandMix | None) -> Scene:
-    origin = source.crop_origin
-    return read_scene(source.image, source.model, sigma_m=1.0, bands=bands, crop_origin=origin)
+def _scene(
+    source: ImageFiles, bands: BandMix | None, parameter_set: ParameterSet | None = None
+) -> Scene:
+    return read_scene(
+        source.image,
+        source.model,
+        sigma_m=1.0,
+        bands=bands,
+        crop_origin=source.crop_origin,
+        parameter_set=parameter_set,
+    )
 
 
 def _is_better_corrected(folder: Path, accuracy: CorrectionAccuracy) -> bool:

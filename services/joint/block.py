@@ -17,6 +17,7 @@ from amers.services.quality.frames import why_unknown
 from amers.services.registration.options import RegistrationOptions
 from amers.services.sensors.base import SensorModel
 from amers.services.sensors.displacement import DisplacementGrid
+from amers.services.sensors.parameter_sets import ParameterSet
 from amers.services.sensors.pushbroom import PushbroomModel
 from amers.services.types import (
     Array,
@@ -145,6 +146,33 @@ def repeated(block: JointBlock, held: Sequence[IntArray], neighbour: KnownImages
     return _adjusted(
         block.scenes, block.images, block.shared, ties, neighbour, rows=rows, like=block.adjustment
     )
+
+
+def with_parameter_sets(
+    block: JointBlock,
+    sets: Sequence[ParameterSet | None],
+    options: RegistrationOptions,
+    neighbour: KnownImages | None,
+) -> JointBlock:
+    """The block adjusted again with other terms of rigorous models free, on the same observations.
+
+    Args:
+        block: adjusted.
+        sets: for every scene; None for one with a correction in the image.
+        options, neighbour: see `adjust_together`.
+
+    Raises:
+        ComputationError: the observations do not allow a solution.
+    """
+    scenes = [
+        replace(measured, scene=replace(measured.scene, parameter_set=own))
+        for measured, own in zip(block.scenes, sets, strict=True)
+    ]
+    images = tuple(
+        _image(measured, image.displacement, options)
+        for measured, image in zip(scenes, block.images, strict=True)
+    )
+    return _adjusted(scenes, images, block.shared, block.ties, neighbour, rows=block.rows)
 
 
 def _adjusted(

@@ -21,6 +21,7 @@ from amers.services.joint.measured import (
     with_own_marks,
     without_own_marks,
 )
+from amers.services.joint.model_errors import with_every_term_free
 from amers.services.joint.results import (
     RigorousScene,
     held_cells,
@@ -313,6 +314,8 @@ def qualified(
         except ComputationError:
             without.append((none, None))
     drawn, of_cells = without[: len(draws)], without[len(draws) :]
+    complete = with_every_term_free(block, options, known)
     return tuple(
-        registered_scene(block, number, options, drawn=drawn, cells=of_cells) for number in numbers
+        registered_scene(block, number, options, drawn=drawn, cells=of_cells, complete=complete)
+        for number in numbers
     )

@@ -14,6 +14,7 @@ from amers.services.adjustment.rigorous_parameters import RigorousParameters
 from amers.services.conventions import CHIP_SIZE
 from amers.services.imagery.scene import scene_gsd_m
 from amers.services.joint.block import JointBlock
+from amers.services.joint.model_errors import of_left_out_terms, of_rpc
 from amers.services.joint.nearest import nearest_correction, scene_heights_m
 from amers.services.misfit.control_observations import declared_fit
 from amers.services.misfit.image_correction import deformation_covariance
@@ -34,6 +35,7 @@ from amers.services.registration.point_results import point_results
 from amers.services.registration.search import shears_of_active
 from amers.services.sensors.moving_pushbroom import AttitudeMotion, attitude_motion
 from amers.services.sensors.pushbroom import PushbroomModel
+from amers.services.sensors.refined import CARRIED_PX, RefinedRpc, refined_rpc
 from amers.services.types import Array, BoolArray, IntArray, Measures
 
 _INDEPENDENT = SharedErrors(1.0, np.zeros(3), 0.0)
@@ -115,6 +117,7 @@ class RigorousScene:
         held: a sentence that names those that the observations do not determine; "" where they do all.
         heights_m: lowest and highest ground of the scene, which fitted models are compared over.
         correction_error_px: largest distance of the nearest correction from the adjusted model.
+        rpc: fitted to the adjusted model.
         attitude: how the satellite turns beyond the parameters; None where it does not.
     """
 
@@ -123,7 +126,12 @@ class RigorousScene:
     held: str
     heights_m: tuple[float, float]
     correction_error_px: float
+    rpc: RefinedRpc
     attitude: AttitudeMotion | None = None
+
+    def is_carried(self, stated_px: float) -> bool:
+        """Whether the RPC is close enough to the model, beside the CE90 stated for its worst place."""
+        return self.rpc.model is not None and self.rpc.max_error_px <= max(stated_px, CARRIED_PX)
 
 
 def rigorous_scene(block: JointBlock, number: int) -> RigorousScene | None:
@@ -134,12 +142,14 @@ def rigorous_scene(block: JointBlock, number: int) -> RigorousScene | None:
         return None
     name, motion = image.name, measured.motion
     own = [each for each in parameter_figures(block.images, block.adjustment) if each.image == name]
+    heights_m = scene_heights_m(block, number)
     return RigorousScene(
         parameter_set.name,
         tuple(own),
         "".join(held_parameters(own)),
-        scene_heights_m(block, number),
+        heights_m,
         nearest_correction(block, number).max_error_px,
+        refined_rpc(block.model(number), measured.scene.image.shape, heights_m),
         attitude_motion(image.model, motion) if motion and image.displacement else None,
     )
 
@@ -182,6 +192,7 @@ def registered_scene(
     *,
     drawn: Sequence[tuple[Sequence[IntArray], JointBlock | None]],
     cells: Sequence[tuple[Sequence[IntArray], JointBlock | None]],
+    complete: JointBlock | None = None,
 ) -> Registration:
     """The registration of one scene of a block.
 
@@ -191,11 +202,14 @@ def registered_scene(
         options: of the registration.
         drawn, cells: measures of each scene that were held out, and the block without them; None where
             there was no solution.
+        complete: the block with every term of its rigorous models free; None where it has none.
     """
     measured = block.scenes[number]
     adjustment = _with_structures(block, number, scene_adjustment(block, number, options))
     measures = point_results(measured.scene, measured.points, measured.search, adjustment)
-    scene = with_findings(_adjusted_scene(block, number, measures, adjustment))
+    scene = _with_model_findings(
+        _adjusted_scene(block, number, measures, adjustment), block, number, complete
+    )
 
     def of_scene(
         repetitions: Sequence[tuple[Sequence[IntArray], JointBlock | None]],
@@ -253,6 +267,25 @@ def _adjusted_scene(
         pixel_findings=measured.scene.pixel_findings or (),
         tie_places=_tie_places(block, number),
     )
+
+
+def _with_model_findings(
+    scene: AdjustedScene, block: JointBlock, number: int, complete: JointBlock | None
+) -> AdjustedScene:
+    """A scene with its findings, those of its rigorous model included.
+
+    An RPC that is too far from the model is not written, and does no harm.
+    """
+    left_out = of_left_out_terms(block, complete, number)
+    scene = replace(scene, model_findings=() if left_out is None else (left_out,))
+    found = with_findings(scene)
+    rigorous = rigorous_scene(block, number)
+    if rigorous is None or not rigorous.is_carried(found.worst_ce90_px):
+        return found
+    carried = of_rpc(scene.model, rigorous.rpc, scene.shape, rigorous.heights_m)
+    if carried is None:
+        return found
+    return with_findings(replace(scene, model_findings=(*scene.model_findings, carried)))
 
 
 def _tie_places(block: JointBlock, number: int) -> Array:

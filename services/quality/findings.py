@@ -47,6 +47,7 @@ def with_findings(scene: AdjustedScene) -> AdjustedScene:
         *_of_neighbours(scene),
         *_of_sight(scene),
         *_of_pixels(scene.pixel_findings),
+        *scene.model_findings,
     ]
     held = _held(scene)
     if scene.elsewhere is not None and scene.elsewhere.slope_px is None:

@@ -1,5 +1,6 @@
 """How stable a correction is: repeated with fewer points."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 
@@ -12,6 +13,7 @@ from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.quality.accuracy import Statistics, statistics
 from amers.services.quality.finding import Finding
 from amers.services.quality.held_area import HeldArea
+from amers.services.quality.normal_law import normal_ce90
 from amers.services.quality.points_elsewhere import Elsewhere
 from amers.services.sensors.base import SensorModel
 from amers.services.types import Array, BoolArray, Frame, IntArray, Measures
@@ -39,6 +41,7 @@ class AdjustedScene:
             it was not looked for any.
         shears: of the chips of active points, with their rows among all; None where it is not known.
         pixel_findings: what is wrong with the pixels.
+        model_findings: what the adjusted model, or the file that carries it, is off by.
         tie_places: (k, 2) line and sample of ties with other scenes, which hold the image as well.
         findings: what the correction does not follow; their harm is in the adjustment.
         held: the part of the image that points hold; None before it is known.
@@ -56,6 +59,7 @@ class AdjustedScene:
     breaks: IntArray | None = None
     shears: ChipShears | None = None
     pixel_findings: tuple[PixelFinding, ...] = ()
+    model_findings: tuple[Finding, ...] = ()
     tie_places: Array | None = None
     findings: tuple[Finding, ...] = ()
     held: HeldArea | None = None
@@ -65,6 +69,13 @@ class AdjustedScene:
         """Line and sample (5, 2) of the corners and the centre, each moved to where points hold."""
         places = image_places(self.shape)
         return places if self.held is None else self.held.nearest(places)
+
+    @property
+    def worst_ce90_px(self) -> float:
+        """CE90 of the worst place that points hold; infinite where they hold none."""
+        if self.held is None or not len(self.held.places):
+            return math.inf
+        return float(normal_ce90(self.adjustment.covariance_at(self.held.places)).max())
 
 
 Repetition = tuple[IntArray, SceneAdjustment | None]

@@ -79,6 +79,22 @@ PARAMETER_SETS = {"srp": SRP, "toutin": TOUTIN, "spot-hrv": SPOT_HRV}
 """The published sets, by the names that options have for them."""
 
 
+def with_every_term(parameter_set: ParameterSet) -> ParameterSet:
+    """The set with the terms of all others free as well, with the largest sigma that any has."""
+    sigmas: dict[str, float] = {}
+    for one in PARAMETER_SETS.values():
+        for term, sigma in one.sigmas.items():
+            sigmas[term] = max(sigma, sigmas.get(term, 0.0))
+    return ParameterSet(f"{parameter_set.name}, every term", sigmas | dict(parameter_set.sigmas))
+
+
+def left_out_of(parameter_set: ParameterSet) -> tuple[str, ...]:
+    """Terms of other sets that a set holds."""
+    return tuple(
+        term for term in with_every_term(parameter_set).sigmas if term not in parameter_set.sigmas
+    )
+
+
 def parameter_set_named(name: str) -> ParameterSet:
     """The set of this name among `PARAMETER_SETS`.
 

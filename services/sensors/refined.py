@@ -12,6 +12,10 @@ from amers.services.sensors.rpc_fit import fit_rpc
 REFIT_LIMIT_PX = 0.01
 """Largest difference, anywhere in the image, of a refitted RPC from the corrected model."""
 
+CARRIED_PX = 0.5
+"""An RPC that misses an adjusted rigorous model by more is not written, unless that is less than what is
+stated; below, its error is part of the stated accuracy. A limit that people set: half a pixel."""
+
 LOUD_PX = 0.1
 """An RPC that differs by more than this from the refined model is delivered with a warning."""
 

@@ -230,6 +230,7 @@ def write_registered(
             registration.model,
             rigorous.heights_m,
             rigorous.correction_error_px,
+            rigorous.rpc,
             rigorous.attitude,
         )
     folder.mkdir(parents=True, exist_ok=True)

@@ -25,7 +25,7 @@ from amers.services.sensors.base import SensorModel
 from amers.services.sensors.correction import CorrectedModel
 from amers.services.sensors.moving_pushbroom import AttitudeMotion
 from amers.services.sensors.ortho import OrthoModel, fold_into_ortho
-from amers.services.sensors.refined import LOUD_PX, REFIT_LIMIT_PX, refined_rpc
+from amers.services.sensors.refined import CARRIED_PX, LOUD_PX, REFIT_LIMIT_PX, RefinedRpc, refined_rpc
 from amers.services.sensors.rpc import RpcModel
 from amers.services.types import UNKNOWN_FRAME, Array, Frame
 
@@ -44,12 +44,14 @@ class AdjustedRigorous:
         model: adjusted.
         heights_m: lowest and highest ground of the scene, over which an RPC is fitted.
         correction_error_px: largest distance of the nearest correction from the adjusted model.
+        rpc: fitted to the adjusted model.
         attitude: how the satellite turns beyond the parameters; None where it does not.
     """
 
     model: SensorModel
     heights_m: tuple[float, float]
     correction_error_px: float
+    rpc: RefinedRpc
     attitude: AttitudeMotion | None = None
 
 
@@ -108,8 +110,9 @@ def write_refined(
     | the same, of a satellite that turns beyond the parameters | also `attitude.csv` |
     | any of a GeoTIFF | a copy of the image with new tags, when `copy_image` |
 
-    An RPC that differs from the corrected model by 0.01 px or more is not written: `correction.json`
-    then applies to the delivered model.
+    An RPC that differs from the model with an affine correction by 0.01 px or more is not written, nor
+    one that misses a displacement or an attitude by more than is stated: `correction.json` then applies
+    to the delivered model.
 
     Args:
         source: the files that the scene was read from.
@@ -163,7 +166,7 @@ def _write_model(
     base = model.base if isinstance(model, CorrectedModel) else None
     if isinstance(model, AdjustedRigorous):
         delivered = _delivered_rpc(*source)
-        model_files = _write_fitted(delivered, model, shape, folder, copied)
+        model_files = _write_fitted(delivered, model, folder, copied, stated_px=stated_px)
         applies_to = (
             f"{OF_RIGOROUS} of {image_path.name}: the nearest correction to the adjusted one, "
             f"{model.correction_error_px:.2g} px off it at most"
@@ -219,15 +222,26 @@ def _write_rpc(
 def _write_fitted(
     delivered: DeliveredModel | None,
     adjusted: AdjustedRigorous,
-    shape: tuple[int, int],
     folder: Path,
     copied: Path | None,
+    *,
+    stated_px: float,
 ) -> RefinedFiles:
     """The RPC fitted to an adjusted rigorous model, also in the format of a delivered RPC."""
-    refined = refined_rpc(adjusted.model, shape, adjusted.heights_m)
+    refined = adjusted.rpc
     low, high = adjusted.heights_m
+    instead = f"{CORRECTION_JSON} with the delivered rigorous model"
+    if adjusted.attitude:
+        instead += f", or its parameters as found and {ATTITUDE_CSV}"
     if refined.model is None:
         note = f"no RPC could be fitted to the adjusted rigorous model at {low:.0f} to {high:.0f} m"
+        return RefinedFiles((), refined.max_error_px, note)
+    if refined.max_error_px > max(stated_px, CARRIED_PX):
+        note = (
+            f"no refined RPC is written: the nearest is up to {refined.max_error_px:.2g} px off the "
+            f"adjusted rigorous model, more than the CE90 of {stated_px:.2g} px that is stated relative "
+            f"to the control points; no RPC follows this attitude. Use {instead}"
+        )
         return RefinedFiles((), refined.max_error_px, note)
     files = write_model(delivered, refined.model, folder, copied)
     names, off_px = ", ".join(file.name for file in files), refined.max_error_px
@@ -238,10 +252,7 @@ def _write_fitted(
     if off_px > FIT_LIMIT_PX:
         note = f"WARNING: more than {FIT_LIMIT_PX:g} px off: {note}; no RPC follows this attitude closer"
         if adjusted.attitude:
-            note += (
-                f". Use {CORRECTION_JSON} with the delivered rigorous model, or its parameters as found "
-                f"and {ATTITUDE_CSV}"
-            )
+            note += f". Use {instead}"
     return RefinedFiles(tuple(files), off_px, note)
 
 
