@@ -17,7 +17,7 @@ FOLLOWED, NAMED = 0.8, 0.9
 
 _BREAKS = ("breaks", "lost or repeated lines")
 LACK_OF_FIT = {
-    "jitter": ("structure_lines", "structure_steps", "structure_chips"),
+    "jitter": ("structure_lines", "structure_steps"),
     "bow": ("structure_lines", "structure_samples", "structure_image"),
     "steps": ("structure_lines", "structure_steps", "points_elsewhere", *_BREAKS),
     "moved": ("points_elsewhere", "structure_image"),

@@ -21,7 +21,6 @@ from amers.services.misfit.image_correction import deformation_covariance
 from amers.services.misfit.placed_measures import PlacedMeasures
 from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.misfit.shared_errors import SharedErrors
-from amers.services.misfit.short_motion import STILL
 from amers.services.misfit.structure import unfollowed_variance_px2
 from amers.services.quality.cell_stability import cell_stability_of, cells_of
 from amers.services.quality.findings import with_findings
@@ -74,7 +73,6 @@ def scene_adjustment(block: JointBlock, number: int, options: RegistrationOption
         deformation=deformation,
         local_sigma_px=np.hypot(alone.local_sigma_px if alone else 0.0, nearest.local_px),
         shared=alone.shared if alone else _INDEPENDENT,
-        short_motion=alone.short_motion if alone else STILL,
         apart_px=alone.apart_px if alone else 0.0,
         residual_px=np.where(measured.usable[:, None], residual_px, np.nan),
         active=active,
@@ -102,7 +100,7 @@ def _with_structures(block: JointBlock, number: int, adjustment: SceneAdjustment
     unfollowed = unfollowed_variance_px2(tested, of_image)
     return replace(
         adjustment,
-        structures=(*tested, adjustment.short_motion.structure),
+        structures=tested,
         local_sigma_px=np.sqrt(np.maximum(adjustment.local_sigma_px**2, unfollowed)),
     )
 

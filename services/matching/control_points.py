@@ -18,7 +18,6 @@ from amers.services.imagery.source import (
 )
 from amers.services.matching.chip_extent import central_square, visible_half_side
 from amers.services.matching.chip_shears import ChipShears, chip_shears
-from amers.services.matching.chip_strips import chip_strips
 from amers.services.matching.correlate import (
     FOUND,
     CorrelationOptions,
@@ -37,7 +36,6 @@ from amers.services.matching.view_combination import (
     no_measure,
 )
 from amers.services.matching.view_selection import ViewDistanceScales, select_views
-from amers.services.misfit.short_motion import ChipStrips
 from amers.services.sensors.base import SensorModel
 from amers.services.types import (
     Acquisition,
@@ -96,7 +94,6 @@ class PointMatches:
         common_covariance_m2: (2, 2) east and north, of the error that all the measures share: see
             `systematic_error`.
         view_measures: result of every view that was tried; its rows are those of the points.
-        strips: how parts of the chips move against each other; None where it is not known.
         shears: of the chips, by slopes that they and the scene see from different directions; None
             where it is not known.
     """
@@ -110,7 +107,6 @@ class PointMatches:
     by_gradient: BoolArray
     common_covariance_m2: Array
     view_measures: ViewMeasures
-    strips: ChipStrips | None = None
     shears: ChipShears | None = None
 
 
@@ -227,14 +223,11 @@ def with_matches(matches: PointMatches, rows: IntArray, again: PointMatches) -> 
     views["point"] = np.concatenate([before.point[kept], rows[after.point[added]]])
     order = np.argsort(views["point"], kind="stable")
     view_measures = ViewMeasures(**{name: column[order] for name, column in views.items()})
-    strips = matches.strips
-    if strips is not None and again.strips is not None:
-        strips = strips.replaced(into, again.strips.take(of_them))
     shears = matches.shears
     if shears is not None and again.shears is not None:
         anew = replace(again.shears, point=rows[again.shears.point])
         shears = shears.replaced(into, anew)
-    return replace(matches, view_measures=view_measures, strips=strips, shears=shears, **columns)
+    return replace(matches, view_measures=view_measures, shears=shears, **columns)
 
 
 def _not_searched(reason: str) -> _PointMatch:
@@ -325,16 +318,8 @@ def _assembled(
         by_gradient=np.array([match.by_gradient for match in matches], dtype=bool),
         common_covariance_m2=_common_covariance_px2(search, points, matches, order) * search.gsd_m**2,
         view_measures=_view_measures(matches),
-        strips=_strips(search, points, matches) if search.parts else None,
         shears=_shears(points, matches) if search.parts else None,
     )
-
-
-def _strips(search: ChipSearch, points: ControlPoints, matches: list[_PointMatch]) -> ChipStrips:
-    """How parts of the chips of all points move against each other in the scene."""
-    derivative = search.model.project_derivative(points.lon_lat_h)
-    by_row_col = search.gsd_m * np.stack([-derivative[:, :, 1], derivative[:, :, 0]], axis=-1)
-    return chip_strips([match.combination for match in matches], by_row_col)
 
 
 def _shears(points: ControlPoints, matches: list[_PointMatch]) -> ChipShears:

@@ -20,8 +20,6 @@ class ViewCombination:
         excess_px2: sum of the squared distances of the views from the measure, less what their residuals
             explain.
         weight: (views,) of each view in the measure; 0 where it does not agree.
-        influence, leverage: (c, c, 2) and (c, c, 2, 2) of the squares of the chip on the measure, see
-            `least_squares.Fit`.
         reason: `FOUND`, or why there is no measure.
     """
 
@@ -29,8 +27,6 @@ class ViewCombination:
     sigma_px: float
     excess_px2: float
     weight: Array
-    influence: Array
-    leverage: Array
     reason: str
 
     @property
@@ -54,8 +50,7 @@ def combine_views(peaks: list[Peak], agreement_px: float) -> ViewCombination:
 
 def no_measure(views: int, reason: str) -> ViewCombination:
     """The combination of views of which none gives a measure."""
-    nothing = np.zeros((0, 0, 2)), np.zeros((0, 0, 2, 2))
-    return ViewCombination(np.full(2, np.nan), np.nan, 0.0, np.zeros(views), *nothing, reason)
+    return ViewCombination(np.full(2, np.nan), np.nan, 0.0, np.zeros(views), reason)
 
 
 def _weighted_mean(peaks: list[Peak], rows: IntArray) -> ViewCombination:
@@ -71,7 +66,6 @@ def _weighted_mean(peaks: list[Peak], rows: IntArray) -> ViewCombination:
     mean = weight @ row_col
     influences = np.stack([peak.influence for peak in agreeing])
     common = np.tensordot(weight, influences, axes=1)
-    leverage = np.tensordot(weight, np.stack([peak.leverage for peak in agreeing]), axes=1)
     explained = sum(np.trace(covariance_from_influence(each - common)) for each in influences)
     all_weights = np.zeros(len(peaks))
     all_weights[rows] = weight
@@ -80,8 +74,6 @@ def _weighted_mean(peaks: list[Peak], rows: IntArray) -> ViewCombination:
         sigma_per_coordinate(covariance_from_influence(common)),
         float(((row_col - mean) ** 2).sum() - explained),
         all_weights,
-        common,
-        leverage,
         FOUND,
     )
 

@@ -6,7 +6,6 @@ import numpy as np
 
 from amers.services.misfit.affine_fit import AffineFit
 from amers.services.misfit.broken_image import MOST_BEYOND, on_one_side
-from amers.services.misfit.short_motion import ChipStrips
 from amers.services.sensors.base import SensorModel
 from amers.services.sensors.correction import no_correction
 from amers.services.types import Array, BoolArray, IntArray
@@ -33,7 +32,6 @@ class ControlObservations:
         frame_covariance_m2: (b, 3, 3) of the frames of the blocks, east, north, up, NaN where unknown;
             `block` counts its rows. None when all are unknown.
         chip_side_px: side of the chips in the scene: nearer measures share pixels. 0 when none do.
-        strips: of the chips, as they move against each other; None where it is not known.
         breaks: (k,) first lines behind breaks of the image, where lines are missing or repeated; None
             for none.
     """
@@ -48,7 +46,6 @@ class ControlObservations:
     block: IntArray | None = None
     frame_covariance_m2: Array | None = None
     chip_side_px: float = 0.0
-    strips: ChipStrips | None = None
     breaks: IntArray | None = None
 
 

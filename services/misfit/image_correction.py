@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from amers.services.misfit.affine_start import AffineStart, affine_start
-from amers.services.misfit.broken_image import held_parts, on_one_side, part_of_line
+from amers.services.misfit.broken_image import held_parts, part_of_line
 from amers.services.misfit.control_observations import ControlObservations
 from amers.services.misfit.displacement_components import Component
 from amers.services.misfit.displacement_solution import solve_displacement
@@ -25,11 +25,9 @@ from amers.services.misfit.scene_adjustment import AdjustmentOptions, SceneAdjus
 from amers.services.misfit.scene_motion import SceneMotion, what_moves
 from amers.services.misfit.scene_solution import AgreeingMeasures
 from amers.services.misfit.shared_errors import SharedErrors, likeliest_shared_errors
-from amers.services.misfit.short_motion import STILL, ShortMotion, short_motion
 from amers.services.misfit.structure import unfollowed_variance_px2
 from amers.services.sensors.base import SensorModel
 from amers.services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
-from amers.services.sensors.displacement import DisplacementGrid
 from amers.services.types import Array, BoolArray, IntArray
 
 _DEFORMED = 0.5, 1.0, 1.0
@@ -184,13 +182,10 @@ def _solved(
     misfit_px = explained.misfit - design @ correction.parameters.T
     of_image = np.median((1.0 - start.of_points / start.declared.variance)[active], axis=0)
     local_px2 = measures.shared.clear_share * of_image * np.mean(misfit_px[active] ** 2, axis=0)
-    short, tested = (
-        (like.short_motion, like.structures)
+    tested = (
+        like.structures
         if like
-        else (
-            _short_motion(measured, observations, active, displacement),
-            measured.structures(start.fit, active, components, measures.shared, motion.along_axes),
-        )
+        else measured.structures(start.fit, active, components, measures.shared, motion.along_axes)
     )
     unfollowed = unfollowed_variance_px2(tested, of_image)
     return SceneAdjustment(
@@ -200,9 +195,8 @@ def _solved(
         slope_px=start.slope_px,
         covariance=covariance + deformation,
         deformation=deformation,
-        local_sigma_px=np.sqrt(np.maximum(local_px2, unfollowed) + short.variance_px2),
+        local_sigma_px=np.sqrt(np.maximum(local_px2, unfollowed)),
         shared=measures.shared,
-        short_motion=short,
         apart_px=start.apart_px,
         residual_px=np.where((start.usable | active)[:, None], misfit_px, np.nan),
         active=active,
@@ -210,7 +204,7 @@ def _solved(
         point_sigma_px=np.sqrt(start.of_points[active].mean(axis=0)),
         components=components,
         left_open=left_open,
-        structures=tested if like else (*tested, short.structure),
+        structures=tested,
     )
 
 
@@ -245,26 +239,6 @@ def _beside(
     if beside.moved:
         moved = replace(beside.moved, measures=moved.measures | beside.moved.measures)
     return replace(beside, residual_px=residual_px, moved=moved)
-
-
-def _short_motion(
-    measured: PlacedMeasures,
-    observations: ControlObservations,
-    active: BoolArray,
-    displacement: DisplacementGrid | None,
-) -> ShortMotion:
-    """The motion within the chips of active measures (n,) that a displacement does not follow."""
-    if observations.strips is None or not measured.scanned:
-        return STILL
-    if observations.breaks is not None:
-        # Beyond a break, a chip shows other lines, not a motion.
-        line, side_px = observations.line_sample[:, 0], observations.chip_side_px
-        active = active & on_one_side(observations.breaks, line, side_px, 0.0)
-    place, strips = measured.position_px[active], observations.strips.take(active)
-    if displacement is not None:
-        left_px = strips.displacement_px - strips.against(displacement, place)
-        strips = replace(strips, displacement_px=left_px)
-    return short_motion(strips, place, observations.chip_side_px)
 
 
 def _in_held_parts(observations: ControlObservations, active: BoolArray) -> BoolArray:

@@ -19,7 +19,6 @@ from amers.services.misfit.control_observations import ControlObservations
 from amers.services.misfit.robust import MAD_TO_STD
 from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.misfit.shared_errors import SharedErrors
-from amers.services.misfit.short_motion import STILL
 from amers.services.sensors.base import SensorModel
 from amers.services.sensors.correction import no_correction
 from amers.services.types import Array, BoolArray, IntArray
@@ -285,7 +284,6 @@ def _marked(stated: _System, found: _Agreement, sigma0: float) -> MarkedScene:
         deformation=np.zeros((6, 6)),
         local_sigma_px=np.zeros(2),
         shared=SharedErrors(max(sigma0, 1.0) ** 2, np.zeros(3), 0.0),
-        short_motion=STILL,
         apart_px=0.0,
         residual_px=np.where(system.seen[:, None], residual, np.nan),
         active=active,

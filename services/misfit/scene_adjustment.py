@@ -6,7 +6,6 @@ from amers.services.misfit.affine_fit import Order
 from amers.services.misfit.displacement_components import Component
 from amers.services.misfit.moved_ground import MovedGround
 from amers.services.misfit.shared_errors import SharedErrors
-from amers.services.misfit.short_motion import ShortMotion
 from amers.services.misfit.structure import Structure
 from amers.services.sensors.correction import ImageCorrection
 from amers.services.types import Array, BoolArray
@@ -60,9 +59,8 @@ class SceneAdjustment:
             order leaves out. It is relative to the frame that the blocks of the points scatter about.
         deformation: (6, 6) part of it by what the points share, as they are deformed.
         local_sigma_px: (2,) standard deviation, line and sample, of what parts of the image are off by
-            and no correction follows: seams between detectors, terrain, motion within chips.
+            and no correction follows: seams between detectors, terrain.
         shared: what the residuals tell of errors that the points share.
-        short_motion: what chips show of motion within them.
         apart_px: standard deviation of the offsets of the points' blocks, beyond chance; 0 for one.
         residual_px: (n, 2) observed minus computed, line and sample, of all measures.
         active: (n,) measures that were not deactivated.
@@ -84,7 +82,6 @@ class SceneAdjustment:
     deformation: Array
     local_sigma_px: Array
     shared: SharedErrors
-    short_motion: ShortMotion
     apart_px: float
     residual_px: Array
     active: BoolArray

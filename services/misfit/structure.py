@@ -21,9 +21,8 @@ from scipy.special import fdtrc
 
 from amers.services.types import Array
 
-Family = Literal["lines", "steps", "samples", "seams", "image", "height", "chips"]
-"""What residuals may depend on; "steps" are along the lines, "seams" steps along the samples, "chips"
-motion within chips."""
+Family = Literal["lines", "steps", "samples", "seams", "image", "height"]
+"""What residuals may depend on; "steps" are along the lines, "seams" steps along the samples."""
 ALONG_AXES: tuple[Family, ...] = ("lines", "steps", "samples", "seams")
 OTHERWISE: tuple[Family, ...] = ("image", "height")
 _OF_PLACES: tuple[Family, ...] = (*ALONG_AXES, "image")

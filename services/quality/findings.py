@@ -78,7 +78,7 @@ def _of_breaks(scene: AdjustedScene) -> list[Finding]:
 
 
 def _of_structures(scene: AdjustedScene) -> list[Finding]:
-    """Structures of the residuals. Those along places and within chips are in the stated accuracy."""
+    """Structures of the residuals, which the stated accuracy includes."""
     found = scene.adjustment.structures
     told = [one for one in found if one.chance < MOST_CHANCE and one.family != "height"]
     return [_note(one, scene.shape) for one in told]

@@ -14,11 +14,6 @@ def structure_words(structure: Structure, shape: tuple[int, int]) -> str:
     """
     line_px, sample_px = (structure.size_px * np.sqrt(2.0)).tolist()
     size = f"{line_px:.2f} px in line and {sample_px:.2f} px in sample"
-    if structure.family == "chips":
-        return (
-            f"parts of chips are displaced against each other by {size}, most clearly with a period of "
-            f"{structure.at:.0f} lines. Possible cause: attitude jitter that is shorter than a chip"
-        )
     if structure.shape == "step":
         where, cause = "line", "lines that were lost or repeated"
         if structure.family == "seams":

@@ -157,15 +157,6 @@ def adjust_with_marks(
 def searched_with_marks(search: Search, count: int, marks: SceneMarks) -> Search:
     """A search with marks as points that were found; they stand behind all `count` points."""
     n, matches = len(marks), search.matches
-    strips = matches.strips
-    if strips is not None:
-        unknown = np.full((n, *strips.displacement_px.shape[1:]), np.nan)
-        strips = replace(
-            strips,
-            line=np.concatenate([strips.line, np.zeros((n, strips.line.shape[1]))]),
-            displacement_px=np.concatenate([strips.displacement_px, unknown]),
-            sigma_px=np.concatenate([strips.sigma_px, unknown]),
-        )
     matches = replace(
         matches,
         line_sample=np.concatenate([matches.line_sample, marks.line_sample]),
@@ -175,7 +166,6 @@ def searched_with_marks(search: Search, count: int, marks: SceneMarks) -> Search
         views=np.concatenate([matches.views, np.zeros(n, dtype=np.int64)]),
         reason=np.concatenate([matches.reason, np.full(n, "")]),
         by_gradient=np.concatenate([matches.by_gradient, np.zeros(n, dtype=np.bool_)]),
-        strips=strips,
     )
     return replace(
         search,

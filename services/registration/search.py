@@ -127,15 +127,12 @@ def control_observations(scene: Scene, search: Search, usable: BoolArray) -> Con
     ground_to_px = derivative[:, :2]
     shared_m2 = shared_frame(search.points, usable).shared_m2
     chip_side_px = search.chip_side_m * float(abs(np.linalg.det(ground_to_px)) ** 0.5)
-    line_sample, strips = matches.line_sample, matches.strips
+    line_sample = matches.line_sample
     if search.displacement is not None:
         # Chips average over their pixels: what they were compared through, they did not.
         place = scene.model.project(search.points.lon_lat_h)
         followed = search.displacement.at(place) - search.displacement.averaged(place, chip_side_px)
         line_sample = line_sample - followed
-        if strips is not None:
-            moved_px = strips.displacement_px + strips.against(search.displacement, place)
-            strips = replace(strips, displacement_px=moved_px)
     return ControlObservations(
         lon_lat_h=search.points.lon_lat_h,
         line_sample=line_sample,
@@ -147,7 +144,6 @@ def control_observations(scene: Scene, search: Search, usable: BoolArray) -> Con
         block=search.points.block,
         frame_covariance_m2=np.array([frame.covariance_m2 for frame in search.points.frames]),
         chip_side_px=chip_side_px,
-        strips=strips,
         breaks=search.breaks,
     )
 

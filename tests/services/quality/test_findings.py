@@ -26,7 +26,7 @@ def structure(family: Family, size_px: float, chance: float) -> Structure:
     return Structure(family, chance, "period", 800.0, np.full(2, size_px), size_px, np.full(2, np.nan))
 
 
-@pytest.mark.parametrize("family", ["lines", "steps", "samples", "seams", "image", "chips"])
+@pytest.mark.parametrize("family", ["lines", "steps", "samples", "seams", "image"])
 def test_what_is_significant_and_harmless_is_a_note(registered: Make, family: Family) -> None:
     """Four centimetres at 1e-23: the adjustment has stated what it may be off by."""
     scene = registered()

@@ -20,7 +20,6 @@ def words_of(family: Family, shape: str = "period", at: float = 800.0) -> str:
         ("lines", "attitude jitter"),
         ("samples", "seams between detectors"),
         ("image", "errors of the terrain"),
-        ("chips", "attitude jitter that is shorter than a chip"),
     ],
 )
 def test_a_structure_says_what_it_looks_like(family: Family, words: str) -> None:
