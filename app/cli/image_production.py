@@ -18,7 +18,7 @@ from amers.app.usecases.executors import ComputeOptions
 from amers.app.usecases.ground_classes import GroundFiles
 from amers.app.usecases.image_production import ProductionImages, WorkPlace, run_image_production
 from amers.app.usecases.image_selection import CatalogueRequest, run_selection
-from amers.app.usecases.model_choice import ModelChoice
+from amers.app.usecases.model_choice import ModelChoice, stated_metres
 from amers.app.usecases.new_block import BlockIdentity, refuse_existing
 from amers.services.formats.addresses import file_place
 from amers.services.production.image_production import Production, ProductionOptions
@@ -42,7 +42,7 @@ class ImageOptions:
         area: GeoJSON of the ground to see, for --catalogue.
         since: leave out images of --catalogue before this day.
         selection: folder that `amers production select` has written.
-        sigma_m: accuracy of the models, one sigma, metres.
+        sigma_m: accuracy of the models, one sigma, metres; for one of --images IMAGE=M, repeat.
         ortho_sigma_m: the same of those that are ortho-images; by default --sigma-m.
     """
 
@@ -51,7 +51,7 @@ class ImageOptions:
     area: Path | None = None
     since: Annotated[datetime | None, typer.Option(formats=["%Y-%m-%d"])] = None
     selection: Path | None = None
-    sigma_m: FromCenti = None
+    sigma_m: Annotated[tuple[str, ...], typer.Option()] = ()
     ortho_sigma_m: FromCenti = None
 
     def check(self) -> None:
@@ -132,15 +132,18 @@ def run(
     images.check()
     fine_m, coarse_m = sampling_pair(gsd_m)
     control_files = control.files(neighbour)
+    files = tuple(map(file_place, images.images))
+    sigma_m, sigmas_m = stated_metres("--sigma-m", images.sigma_m, files)
     refuse_existing(output)
     with shown_progress() as progress:
         selection = images.selected(output, part_of(progress, 0.0, _SHARE_OF_SELECTION))
         production = run_image_production(
             ProductionImages(
-                tuple(map(file_place, images.images)),
+                files,
                 selection,
-                images.sigma_m,
+                sigma_m,
                 images.ortho_sigma_m,
+                sigmas_m,
                 control_files,
                 ground,
                 models,

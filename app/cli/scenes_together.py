@@ -8,11 +8,11 @@ import typer
 
 from amers.app.cli.control_options import MarkOptions
 from amers.app.cli.joint_registration import JointRequest, register_together
-from amers.app.cli.options import FromCenti, FromMilli
+from amers.app.cli.options import FromMilli
 from amers.app.cli.output import AsJson, print_json, show_one
 from amers.app.cli.scene_registration import images_of, worst_status
 from amers.app.cli.scene_rows import refuse_shared_files, show_failures, show_outcomes
-from amers.app.usecases.model_choice import ModelChoice
+from amers.app.usecases.model_choice import ModelChoice, metres_by_image
 from amers.app.usecases.registration.register import SceneFiles
 from amers.services.sensors.parameter_sets import parameter_set_named
 
@@ -24,7 +24,7 @@ class JointOptions:
     Attributes:
         block: use the points of this block folder instead of the store.
         join: output folder of scenes registered together before; they stay as they are.
-        sigma_m: accuracy of the models, one sigma, metres.
+        sigma_m: accuracy of the models, one sigma, metres; for one of the images IMAGE=M, repeat.
         bands: bands to use: 2, or 1,2,3 for their mean, or 3:0.3,2:0.7.
         rigorous: adjust orbit, attitude and camera of the scenes whose metadata have a rigorous model:
             srp, toutin or spot-hrv.
@@ -34,7 +34,7 @@ class JointOptions:
 
     block: Path | None = None
     join: Path | None = None
-    sigma_m: FromCenti = None
+    sigma_m: Annotated[tuple[str, ...], typer.Option()] = ()
     bands: str | None = None
     rigorous: str | None = None
     max_ce90_on_earth_m: FromMilli = None
@@ -70,10 +70,16 @@ def register_many(
         parameter_set_named(rigorous)
     images = images_of(scenes)
     refuse_shared_files(images, [])
+    sigmas_m = metres_by_image("--sigma-m", options.sigma_m, images)
     request = JointRequest(
         files=[
             SceneFiles(
-                image, model, options.sigma_m, options.bands, rigorous=rigorous, crop_origin=origin
+                image,
+                model,
+                sigmas_m.get(image),
+                options.bands,
+                rigorous=rigorous,
+                crop_origin=origin,
             )
             for image, (model, origin) in models.of(images).items()
         ],

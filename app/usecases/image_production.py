@@ -3,7 +3,7 @@
 import hashlib
 import pickle
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
@@ -51,6 +51,7 @@ class ProductionImages:
         selection: folder that `run_selection` has written; its images are added.
         sigma_m: accuracy of the images' models, metres; by default that of the producer or the sensor.
         ortho_sigma_m: the same of those that are ortho-images; by default `sigma_m`.
+        sigmas_m: the same of single files.
         control: places the block on the Earth.
         ground: where no points are wanted, and what points stand on.
         models: of the files whose names and tags do not give them.
@@ -60,6 +61,7 @@ class ProductionImages:
     selection: Path | None = None
     sigma_m: float | None = None
     ortho_sigma_m: float | None = None
+    sigmas_m: Mapping[FilePlace, float] = field(default_factory=dict)
     control: ControlFiles = field(default_factory=ControlFiles)
     ground: GroundFiles = field(default_factory=GroundFiles)
     models: ModelChoice = field(default_factory=ModelChoice)
@@ -167,11 +169,20 @@ def _read(
         stack.callback(scene.image.close)  # type: ignore[attr-defined]
         scenes.append(scene)
 
-    sigma_m, ortho_sigma_m = images.sigma_m, images.ortho_sigma_m
+    sigma_m, ortho_sigma_m, sigmas_m = images.sigma_m, images.ortho_sigma_m, images.sigmas_m
     chosen_models = images.models.of([path for path in images.files if isinstance(path, Path)])
     for path in images.files:
         model, origin = chosen_models[path] if isinstance(path, Path) else (None, None)
-        add(read_scene(path, model, sigma_m=sigma_m, ortho_sigma_m=ortho_sigma_m, crop_origin=origin))
+        own_m = sigmas_m.get(path)
+        add(
+            read_scene(
+                path,
+                model,
+                sigma_m=own_m or sigma_m,
+                ortho_sigma_m=own_m or ortho_sigma_m,
+                crop_origin=origin,
+            )
+        )
     if images.selection is not None:
         source = images.selection / ITEMS
         chosen = read_catalogue(str(source), elsewhere=True)

@@ -10,9 +10,9 @@ from amers.app.usecases.control_experiment import adjustable, with_stated_sigmas
 from amers.app.usecases.marks_in_images import (
     ImageMarks,
     MarkedImages,
-    metres_by_image,
     read_image_marks,
 )
+from amers.app.usecases.model_choice import metres_by_image
 from amers.app.usecases.terrain_file import TerrainFile, read_terrain
 from amers.services.adjustment.control_ground import NO_CONTROL, ControlGround
 from amers.services.errors import CoverageError

@@ -10,7 +10,7 @@ import numpy as np
 
 from amers.app.errors import InputError
 from amers.app.usecases.marked_files import images_of_marks
-from amers.app.usecases.model_choice import ModelChoice, by_image
+from amers.app.usecases.model_choice import ModelChoice, metres_by_image
 from amers.app.usecases.registered_scene import SceneModel, adjusted_model, read_registered_scene
 from amers.services.adjustment.intersected_marks import EXACT_MODEL, ModelErrors
 from amers.services.formats.block.reader import read_document
@@ -153,27 +153,6 @@ def _scene(
     sigma_m = metres_by_image("--sigma-m", files.sigma_m, files.images).get(image)
     scene = read_scene(image, model, sigma_m=sigma_m, crop_origin=origin, parameter_set=rigorous)
     return scene, None
-
-
-def metres_by_image(option: str, values: Sequence[str], images: Sequence[Path]) -> dict[Path, float]:
-    """Lengths that are stated of images: of one each, IMAGE=M, or one value alone of every image.
-
-    Raises:
-        InputError: a value is no length above 0, or of no image.
-    """
-    if len(values) == 1 and "=" not in values[0]:
-        return dict.fromkeys(images, _metres(option, values[0]))
-    return {image: _metres(option, text) for image, text in by_image(option, values, images).items()}
-
-
-def _metres(option: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not 0.0 < value < 1e6:
-        raise InputError(f"{option}: {text[:60]!r} found, metres above 0 expected, such as 5")
-    return value
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,14 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from amers.app.errors import InputError
+from amers.services.formats.addresses import FilePlace
 from amers.services.formats.text_files import NUMBER_PATTERN
 
 CropOrigin = tuple[float, float]
+Place = TypeVar("Place", Path, FilePlace)
 
 
 @dataclass(frozen=True)
@@ -61,9 +64,9 @@ def parse_crop_origin(text: str, source: str = "--crop-origin") -> CropOrigin:
     return float(found[1]), float(found[2])
 
 
-def by_image(option: str, values: Iterable[str], images: Sequence[Path]) -> dict[Path, str]:
+def by_image(option: str, values: Iterable[str], images: Sequence[Place]) -> dict[Place, str]:
     """The values of an option by their images: FILE of the only image, IMAGE=FILE of one of several."""
-    found: dict[Path, str] = {}
+    found: dict[Place, str] = {}
     for value in values:
         name, sign, text = value.partition("=")
         named = [image for image in images if sign and name in (str(image), image.name, image.stem)]
@@ -78,3 +81,39 @@ def by_image(option: str, values: Iterable[str], images: Sequence[Path]) -> dict
             raise InputError(f"{option}: given twice for {named[0].name}, once expected")
         found[named[0]] = text
     return found
+
+
+def metres_by_image(option: str, values: Sequence[str], images: Sequence[Place]) -> dict[Place, float]:
+    """Lengths that are stated of images: of one each, IMAGE=M, and one value alone of all others.
+
+    Raises:
+        InputError: as `stated_metres`.
+    """
+    of_all, own = stated_metres(option, values, images)
+    return own if of_all is None else dict.fromkeys(images, of_all) | own
+
+
+def stated_metres(
+    option: str, values: Sequence[str], images: Sequence[Place]
+) -> tuple[float | None, dict[Place, float]]:
+    """The length that is stated of all images, None without any, and those of single ones, IMAGE=M.
+
+    Raises:
+        InputError: a value is no length above 0, or of no image; or two are of all images.
+    """
+    alone = [value for value in values if "=" not in value]
+    if len(alone) > 1:
+        raise InputError(f"{option}: {alone[0]} and {alone[1]} found, one value of all images expected")
+    stated = by_image(option, [value for value in values if "=" in value], images)
+    own = {image: _metres(option, text) for image, text in stated.items()}
+    return (_metres(option, alone[0]) if alone else None), own
+
+
+def _metres(option: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not 0.0 < value < 1e6:
+        raise InputError(f"{option}: {text[:60]!r} found, metres above 0 expected, such as 5")
+    return value
