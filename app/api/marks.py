@@ -44,7 +44,9 @@ class Mark(_Body):
     height_m: Height | None = Field(
         None, description="Above the ellipsoid; by default that of the terrain of a reference."
     )
-    sigma_m: Sigmas | None = Field(None, description="Of its ground: horizontal and up (1 sigma).")
+    sigma_m: tuple[Sigma | None, Sigma | None] | None = Field(
+        None, description="Of its ground: horizontal and up (1 sigma); null for that of all marks."
+    )
     check: bool = Field(False, description="Whether it is a check point, held out of the adjustment.")
 
 

@@ -45,7 +45,8 @@ class SetMark:
         line, sample: where the image shows it; the centre of the first pixel is (0, 0).
         lon, lat: of its ground, degrees.
         height_m: above the ellipsoid; None for that of the installation's terrain.
-        sigma_m: of its ground, horizontal and up, one standard deviation; None for that of all marks.
+        sigma_m: of its ground, horizontal and up, one standard deviation; None, for both or one of them,
+            for that of all marks.
         check: whether it is a check point.
     """
 
@@ -55,7 +56,7 @@ class SetMark:
     lon: float
     lat: float
     height_m: float | None = None
-    sigma_m: tuple[float, float] | None = None
+    sigma_m: tuple[float | None, float | None] | None = None
     check: bool = False
 
 
@@ -237,7 +238,7 @@ def _of_scene(
     if not marks:
         return None, []
     _refuse_without_height(scene, marks, heights)
-    sigma_m = np.array([mark.sigma_m or (np.nan, np.nan) for mark in marks])[:, [0, 0, 1]]
+    sigma_m = np.array([mark.sigma_m or (None, None) for mark in marks], dtype=np.float64)[:, [0, 0, 1]]
     height_m = np.array([mark.height_m for mark in marks], dtype=np.float64)
     read = marked_points(
         [mark.name for mark in marks],

@@ -11,9 +11,12 @@ import pytest
 import rasterio
 from playwright.sync_api import Locator, Page, expect
 
+from amers.services.formats.sensor_models.rpc_text import format_rpc_text, parse_rpc_text
+from amers.services.sensors.correction import ImageCorrection, fold_into_rpc, no_correction
 from amers.services.types import Array
 from tests.app.flat_world import GROUND_H, FlatWorld
-from tests.journeys.map_page import ARTEFACTS, WIDE, assert_readable, tab_to, until_drawn
+from tests.journeys.map_page import ARTEFACTS, WIDE, assert_readable, poll_ms, tab_to, until_drawn
+from tests.journeys.ties import KnownGround
 from tests.service_process import Service
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
@@ -24,10 +27,13 @@ PICKED = np.array(
         *[[350.0, 700.0], [800.0, 400.0], [300.0, 420.0], [700.0, 850.0], [1050.0, 600.0]],
     ]
 )
+OFF_PX = np.array([24.0, -32.0])
 a_pixel = 1.0
+a_third_of_a_pixel = 1.0 / 3.0
+half_a_pixel = 0.5
 a_blunder_px = 40
 a_hundredth_px = 0.01
-EXPECTED = re.compile(r"expected in the circle of (\d+) px, at line (-?\d+), sample (-?\d+)")
+EXPECTED = re.compile(r"expected in the circle of (\d+) px, at line (-?\d+\.\d), sample (-?\d+\.\d)")
 
 
 def uploaded(service: Service, secret: str, world: FlatWorld) -> str:
@@ -55,7 +61,7 @@ def off_expected(page: Page, image: Locator, line_sample: Array) -> Array:
     """
     prompt = page.locator(".prompt")
     expect(prompt).to_have_text(EXPECTED)
-    radius, line, sample = map(int, EXPECTED.search(prompt.inner_text()).groups())
+    radius, line, sample = map(float, EXPECTED.search(prompt.inner_text()).groups())
     box = image.bounding_box()
     scale = min(0.3 * min(box["width"], box["height"]) / max(radius, 60), 4.0)
     return np.asarray((line_sample - [line, sample]) * scale)
@@ -97,6 +103,12 @@ def residuals_shown(page: Page) -> Array:
     return np.array(
         [[float(part.replace("\N{MINUS SIGN}", "-")) for part in text.split()] for text in texts]
     )
+
+
+def places_shown(page: Page) -> Array:
+    """Lines and samples (n, 2) in the table."""
+    texts = [row.locator("td").all_inner_texts()[:2] for row in rows(page).all()]
+    return np.array(texts, dtype=np.float64)
 
 
 def until_adjusted(page: Page) -> None:
@@ -186,10 +198,7 @@ def test_ten_marks_are_set_with_pointer_and_keys_and_saved_as_the_command_reads_
     until_adjusted(page)
     np.testing.assert_array_equal(residuals_shown(page), before)
 
-    with page.expect_download() as download:
-        page.get_by_role("button", name="Save as CSV").click()
-    marks, out = tmp_path / "marks.csv", tmp_path / "out"
-    marks.write_bytes(download.value.path().read_bytes())
+    marks, out = save_marks(page, tmp_path / "marks.csv"), tmp_path / "out"
     amers("scene", "register", world.tagged, "--sigma-m", "6", "--control", marks, "-o", out)
     assert_same_residuals(json.loads((out / "report.json").read_text()), before)
 
@@ -211,7 +220,7 @@ def test_ten_marks_are_set_with_pointer_and_keys_and_saved_as_the_command_reads_
 
 
 def test_marks_on_a_reference_image_take_heights_of_its_terrain(
-    visit, world, secret, service, administrator, installation
+    visit, world, secret, service, administrator, installation, tmp_path
 ):
     """With the pointer alone, but for what finds a place on the map; one is held out, one changed."""
     add_reference(service, administrator, installation / "references", world)
@@ -225,12 +234,28 @@ def test_marks_on_a_reference_image_take_heights_of_its_terrain(
         field = page.get_by_label("Go to")
         field.fill(f"{lat}, {lon}")
         field.press("Enter")
+        page.wait_for_timeout(poll_ms)
+        until_drawn(page)
         page.locator("#map canvas").click()
         choose_in_image(page, image, place)
         until_adjusted(page)
     print(f"ten marks in {time.monotonic() - began:.0f} s")
     expect(rows(page).get_by_text("used", exact=True)).to_have_count(len(PICKED))
     assert np.abs(residuals_shown(page)).max() < a_pixel
+    np.testing.assert_allclose(places_shown(page), PICKED, atol=a_third_of_a_pixel)
+    before = residuals_shown(page)
+    marks = save_marks(page, tmp_path / "marks.csv")
+    fields = [line.split(",") for line in marks.read_text().splitlines()[1:]]
+    assert fields[0][3:6] == ["height_m", "sigma_horizontal_m", "sigma_up_m"]
+    assert {tuple(row[4:6]) for row in fields[1:]} == {("", "0.5")}
+    page.get_by_label("Open marks").set_input_files(marks)
+    expect(page.locator("#status")).to_have_text("10 marks opened.")
+    until_adjusted(page)
+    np.testing.assert_array_equal(residuals_shown(page), before)
+    other = tmp_path / "other.csv"
+    other.write_text(marks.read_text().replace("sigma_px", "colour"))
+    page.get_by_label("Open marks").set_input_files(other)
+    expect(page.get_by_role("alert")).to_contain_text("colour")
     assert {row.locator("td").nth(4).inner_text() for row in rows(page).all()} == {f"{GROUND_H:.2f}"}
     page.get_by_role("button", name="Show M5").click()
     until_drawn(page)
@@ -247,6 +272,49 @@ def test_marks_on_a_reference_image_take_heights_of_its_terrain(
     page.get_by_label("Reference image on the map").select_option("none")
     until_drawn(page)
     page.screenshot(path=ARTEFACTS / "marks-without-reference.png")
+
+
+@pytest.mark.real_data
+def test_eight_marks_on_the_page_bring_back_a_real_view_whose_model_is_40_px_off(
+    visit, secret, service, real_data, tmp_path
+):
+    """Ground and true places are those of ties with two other views."""
+    ties = KnownGround.of_triplet(real_data)
+    frame = no_correction(ties.shape)
+    off = ImageCorrection(np.column_stack([OFF_PX, np.zeros((2, 2))]), frame.centre, frame.half_size)
+    headers = {"Authorization": f"Bearer {secret}"}
+    with httpx.Client(base_url=service.url, headers=headers, timeout=60.0) as client:
+        content = (real_data / "phr_calanques_triplet" / "img_02.tif").read_bytes()
+        scene = client.post("/scenes?name=img_02.tif", content=content).raise_for_status().json()["id"]
+        model = format_rpc_text(fold_into_rpc(ties.model, off))
+        laid = client.put(f"/scenes/{scene}/files/img_02_RPC.TXT", content=model.encode())
+        laid.raise_for_status()
+    page = visit(f"#/mark/{scene}", secret, WIDE)
+    image = opened(page)
+    page.get_by_text("Accuracy of the marks").click()
+    for label, value in (("Ground, horizontal", "0.1"), ("Ground, up", "0.1")):
+        page.get_by_label(label).fill(value)
+    inner = (np.abs(ties.shown / ties.shape - 0.5) < 0.4).all(axis=1)
+    rows_of_ties = np.random.default_rng(7).permutation(np.flatnonzero(inner))
+    for number, row in enumerate(rows_of_ties[:8]):
+        type_ground(page, ", ".join(f"{value:.9f}" for value in ties.ground[row].tolist()))
+        choose_in_image(page, image, ties.shown[row])
+        expect(rows(page)).to_have_count(number + 1)
+        until_adjusted(page)
+    expect(rows(page).get_by_text("used", exact=True)).to_have_count(8)
+    assert_readable(page, "marks-real")
+    page.set_viewport_size(WIDE)
+    page.get_by_role("button", name="Register with these marks").click()
+    expect(page.get_by_role("link", name="Open the report")).to_be_visible()
+    job = page.url.rsplit("/", 1)[1]
+    results = httpx.get(f"{service.url}/jobs/{job}/results", headers=headers).json()
+    refined = tmp_path / "img_02_RPC.TXT"
+    refined.write_bytes(httpx.get(results[refined.name]["href"], headers=headers).content)
+    others = rows_of_ties[20:]
+    computed = parse_rpc_text(refined.read_text()).project(ties.ground[others])
+    off_px = np.hypot(*(ties.shown[others] - computed).mean(axis=0))
+    print(f"off by {off_px:.2f} px")
+    assert off_px < half_a_pixel
 
 
 def add_reference(service: Service, administrator: str, folder: Path, world: FlatWorld) -> None:
@@ -267,6 +335,13 @@ def add_reference(service: Service, administrator: str, folder: Path, world: Fla
     body = {"name": "land", **files, "sigma_m": 0.5, "sigma_up_m": 0.5}
     headers = {"Authorization": f"Bearer {administrator}"}
     httpx.post(f"{service.url}/references", json=body, headers=headers).raise_for_status()
+
+
+def save_marks(page: Page, path: Path) -> Path:
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Save as CSV").click()
+    path.write_bytes(download.value.path().read_bytes())
+    return path
 
 
 def assert_same_residuals(report: dict, shown: Array) -> None:

@@ -23,6 +23,8 @@ type Shape = Geometry | { type: "FeatureCollection"; features: Outlined[] };
 
 const WORLD: Bounds = [-180, -85, 180, 85];
 const NEAR_PX = 6;
+/** From the edge of a pixel of the screen, as a click has it, to its middle. */
+const MIDDLE_PX = 0.5;
 /** Distance of the degrees of the graticule from the left, lower and upper edges; at the top is the field to go to a place. */
 const LABELS_PX = { left: 6, bottom: 34, top: 62 };
 /** Zoom at which a coordinate is shown, if the map is not closer and no view asks for another. */
@@ -65,10 +67,14 @@ export class Atlas {
     void this.ready.then(() => drawBackground(map, container)).catch((error: Error) => console.warn(error.message));
     for (const event of ["movestart", "dataloading"] as const) map.on(event, () => container.setAttribute("aria-busy", "true"));
     map.on("idle", () => container.setAttribute("aria-busy", "false"));
-    map.on("click", ({ lngLat, point }) => {
-      const id = this.pointAt(map, point);
-      if (this.picked) this.picked([wrapped(lngLat.lng), lngLat.lat], id);
-      else if (id !== undefined) onPoint(id);
+    map.on("click", ({ point: { x, y } }) => {
+      if (!this.picked) {
+        const id = pointAt(map, x, y, NEAR_PX);
+        if (id !== undefined) onPoint(id);
+        return;
+      }
+      const { lng, lat } = map.unproject([x + MIDDLE_PX, y + MIDDLE_PX]);
+      this.picked([wrapped(lng), lat], pointAt(map, x, y, 0));
     });
     const pointer = h("p", { class: "pointer", "aria-hidden": "true" });
     const field = goToField(
@@ -167,7 +173,8 @@ export class Atlas {
     const map = this.map;
     aimWithKeys(map, label, signal, () => {
       const { lng, lat } = map.getCenter();
-      this.picked?.([wrapped(lng), lat], this.pointAt(map, map.project([lng, lat])));
+      const { x, y } = map.project([lng, lat]);
+      this.picked?.([wrapped(lng), lat], pointAt(map, x, y, 0));
     });
   }
 
@@ -177,16 +184,6 @@ export class Atlas {
       const source = this.map?.getSource(name);
       if (source instanceof VectorTileSource) source.setTiles(source.tiles);
     }
-  }
-
-  /** The control point at a place of the screen. */
-  private pointAt(map: MapLibre, { x, y }: { x: number; y: number }): number | undefined {
-    const box: [[number, number], [number, number]] = [
-      [x - NEAR_PX, y - NEAR_PX],
-      [x + NEAR_PX, y + NEAR_PX],
-    ];
-    const [point] = map.queryRenderedFeatures(box, { layers: ["points"] });
-    return point && Number(point.properties["id"]);
   }
 
   /** Mark a position, and show its surroundings, if the map is not closer. */
@@ -230,6 +227,16 @@ export class Atlas {
       for (const [name, value] of paint) this.map?.setPaintProperty(layer.id, name, value as never);
     }
   }
+}
+
+/** The control point whose circle is nearer to a place of the screen than some pixels. */
+function pointAt(map: MapLibre, x: number, y: number, near: number): number | undefined {
+  const box: [[number, number], [number, number]] = [
+    [x - near, y - near],
+    [x + near, y + near],
+  ];
+  const [point] = map.queryRenderedFeatures(box, { layers: ["points"] });
+  return point && Number(point.properties["id"]);
 }
 
 /** Draw the background that the operator has chosen above the land, and name who made it. */

@@ -6,7 +6,7 @@ import { COORDINATE_ZOOM } from "./atlas";
 import { blobUrl, call, get } from "./api";
 import type { AdjustedMark, AdjustedMarks, PlaceOfMarks, PointWithViews, ResultFile, Scene, StatusInfo } from "./api_types";
 import { fill, h, plural, problem } from "./elements";
-import { type Begun, History, type InImage, type Mark, nothingBegun, type OnGround, parseInImage, parseOnGround, readCsv, type State, unlike, writeCsv } from "./marks";
+import { type Begun, History, type InImage, type Mark, nothingBegun, type OnGround, parseInImage, parseOnGround, readCsv, type State, type Stated, unlike, writeCsv } from "./marks";
 import { notesOn, StatedFields, verdictOn } from "./marks_accuracy";
 import { referenceChoice } from "./marks_reference";
 import { MarksTable } from "./marks_table";
@@ -111,8 +111,9 @@ class Marking {
     viewer: (finished: (kind: string, vertices: Pixel[]) => void) => Viewer,
   ) {
     this.key = `amers-marks ${scene.id}`;
-    const kept = JSON.parse(sessionStorage.getItem(this.key) ?? "null") as State | null;
-    this.history = new History(kept ?? { marks: [], begun: nothingBegun([]) });
+    const kept = JSON.parse(sessionStorage.getItem(this.key) ?? "null") as { state: State; stated: Stated } | null;
+    this.history = new History(kept?.state ?? { marks: [], begun: nothingBegun([]) });
+    this.stated.value = kept?.stated ?? {};
     this.viewer = viewer((_, [at]) => this.choose({ image: { sample: at![0] - CENTRE, line: at![1] - CENTRE } }));
   }
 
@@ -288,7 +289,6 @@ class Marking {
   /** Show the marks, and the half that is chosen, everywhere. */
   private refresh(): void {
     const { marks, begun } = this;
-    sessionStorage.setItem(this.key, JSON.stringify(this.history.now));
     this.undo.disabled = !this.history.canUndo;
     this.redo.disabled = !this.history.canRedo;
     this.save.disabled = this.send.disabled = marks.length === 0;
@@ -306,8 +306,14 @@ class Marking {
     if (image && ground && this.lacksHeight(ground)) return "The height is missing: add it after longitude and latitude, in metres above the ellipsoid, then Set.";
     if (image && ground) return "Choose its place in the image or on the map again.";
     if (image) return "Now the same place on the map.";
-    if (ground) return "Now the same place in the image.";
+    if (ground) return `${this.chosen}Now the same place in the image.`;
     return "Choose a place in the image or on the map.";
+  }
+
+  /** The control point that is chosen on the map, for the prompt. */
+  private get chosen(): string {
+    const point = this.begun.ground?.point;
+    return point === undefined ? "" : `Control point ${point}. `;
   }
 
   private drawMarks(): void {
@@ -347,6 +353,7 @@ class Marking {
 
   /** Let the service adjust the model on the marks; only the last of several requests counts. */
   private async adjust(): Promise<void> {
+    sessionStorage.setItem(this.key, JSON.stringify({ state: this.history.now, stated: this.stated.value }));
     const { image, ground } = this.begun;
     const asked = image && !ground ? [image] : ground && !image ? [{ lon: ground.lon, lat: ground.lat, height_m: ground.height_m }] : [];
     this.request.abort();
@@ -399,7 +406,7 @@ class Marking {
     const expected: Expected = { at: pixel({ line, sample }), radius };
     this.viewer.show({ expected });
     this.viewer.goTo({ ...expected, radius: Math.max(radius, AROUND_PX) });
-    this.prompt.textContent = `Now the same place in the image: it is expected in the circle of ${Math.max(radius, 1).toFixed(0)} px, at line ${line.toFixed(0)}, sample ${sample.toFixed(0)}.`;
+    this.prompt.textContent = `${this.chosen}Now the same place in the image: it is expected in the circle of ${Math.max(radius, 1).toFixed(0)} px, at line ${line.toFixed(1)}, sample ${sample.toFixed(1)}.`;
   }
 
   private csv(): File {
@@ -417,7 +424,8 @@ class Marking {
     const [file] = this.file.files ?? [];
     if (!file) return;
     try {
-      const marks = readCsv(await file.text());
+      const { marks, mark_sigma_px } = readCsv(await file.text());
+      if (mark_sigma_px != null) this.stated.value = { mark_sigma_px };
       this.put({ marks, begun: nothingBegun(marks) }, `${plural(marks.length, "mark")} opened.`);
     } catch (error) {
       this.refuse(error);

@@ -14,8 +14,8 @@ export interface OnGround {
   lat: number;
   /** Above the ellipsoid. */
   height_m: number | null;
-  /** Horizontal and up, one standard deviation; null for that of all marks. */
-  sigma_m: [number, number] | null;
+  /** Horizontal and up, one standard deviation; null, for both or one of them, for that of all marks. */
+  sigma_m: [number | null, number | null] | null;
   /** Number of the control point that was chosen. */
   point?: number;
 }
@@ -49,6 +49,7 @@ export interface Stated {
 const MOST_STEPS = 500;
 const ORIGIN = "# pixel-origin=centre heights=ellipsoid";
 const COLUMNS = ["id", "lon", "lat", "height_m", "sigma_horizontal_m", "sigma_up_m", "line", "sample", "sigma_px", "check"] as const;
+const ELSEWHERE = "The form at the scene takes files of every format.";
 const NEEDED = ["lon", "lat", "line", "sample"] as const;
 
 /** The first name that no mark has. */
@@ -123,7 +124,7 @@ export function parseOnGround(text: string): OnGround {
 export function writeCsv(marks: Mark[], results: Map<string, AdjustedMark>, stated: Stated): string {
   const rows = marks.map((mark) => {
     const found = results.get(mark.name);
-    const [horizontal, up] = mark.sigma_m ?? stated.sigma_m ?? [];
+    const [horizontal, up] = [0, 1].map((axis) => mark.sigma_m?.[axis] ?? stated.sigma_m?.[axis]);
     // The sigma of a height of the terrain is that of the terrain.
     const ofTerrain = mark.height_m == null ? found?.sigma_m[2] : null;
     const values: Record<(typeof COLUMNS)[number], string | number | null | undefined> = {
@@ -143,40 +144,43 @@ export function writeCsv(marks: Mark[], results: Map<string, AdjustedMark>, stat
   return [ORIGIN, COLUMNS.join(","), ...rows, ""].join("\n");
 }
 
-/** The marks of a file that `writeCsv` wrote, or one with its first line and some of its columns. */
-export function readCsv(text: string): Mark[] {
+/** The marks of a file that `writeCsv` wrote, or one with its first line and some of its columns, and the sigma of all picks. */
+export function readCsv(text: string): { marks: Mark[]; mark_sigma_px: number | null } {
   const lines = text.split(/\r?\n/).filter((line) => line.trim());
   const comments = lines.filter((line) => line.startsWith("#")).join(" ");
   const [head = "", ...rows] = lines.filter((line) => !line.startsWith("#"));
   const columns = head.split(",").map((column) => column.trim());
-  const missing = NEEDED.filter((column) => !columns.includes(column));
-  if (missing.length) throw new Error(`Columns ${columns.join(", ").slice(0, 80)} found; ${missing.join(", ")} expected as well. Register with files of other formats at the scene.`);
-  if (!/pixel-origin\s*[=:]\s*centre\b/i.test(comments) || !/heights\s*[=:]\s*ellipsoid/i.test(comments)) {
-    throw new Error(`A first line “${ORIGIN}” expected: it says what line and height mean.`);
-  }
+  refuseOther(columns, comments);
   const marks: Mark[] = [];
+  const picks = new Set<number | null>();
   for (const [number, row] of rows.entries()) {
-    const fields = new Map(columns.map((column, at) => [column, row.split(",")[at]?.trim() ?? ""]));
-    const value = (column: string): number | null => {
-      const field = fields.get(column) ?? "";
-      if (field && !Number.isFinite(Number(field))) throw new Error(`Row ${number + 1}: ${column}: “${field}” found, a number expected.`);
-      return field ? Number(field) : null;
+    const fields = row.split(",").map((field) => field.trim());
+    const field = (column: (typeof COLUMNS)[number]): string => fields[columns.indexOf(column)] ?? "";
+    const value = (column: (typeof COLUMNS)[number]): number | null => {
+      if (field(column) && !Number.isFinite(Number(field(column)))) throw new Error(`Row ${number + 1}: ${column}: “${field(column)}” found, a number expected.`);
+      return field(column) ? Number(field(column)) : null;
     };
     const [lon, lat, line, sample] = NEEDED.map(value);
     if (lon == null || lat == null || line == null || sample == null) throw new Error(`Row ${number + 1}: ${NEEDED.join(", ")} expected, found an empty field.`);
-    const [horizontal, up] = [value("sigma_horizontal_m"), value("sigma_up_m")];
-    marks.push({
-      name: unlike(fields.get("id") || nextName(marks), marks),
-      line,
-      sample,
-      lon,
-      lat,
-      height_m: value("height_m"),
-      sigma_m: horizontal != null && up != null ? [horizontal, up] : null,
-      check: ["1", "true", "yes"].includes((fields.get("check") ?? "").toLowerCase()),
-    });
+    const sigma_m: [number | null, number | null] = [value("sigma_horizontal_m"), value("sigma_up_m")];
+    const check = ["1", "true", "yes"].includes(field("check").toLowerCase());
+    marks.push({ name: unlike(field("id"), marks), line, sample, lon, lat, height_m: value("height_m"), sigma_m, check });
+    picks.add(value("sigma_px"));
   }
-  return marks;
+  if (picks.size > 1) throw new Error(`Column sigma_px: ${picks.size} values found, one for all marks expected. ${ELSEWHERE}`);
+  return { marks, mark_sigma_px: [...picks][0] ?? null };
+}
+
+/** Refuse a file whose columns or conventions are others. */
+function refuseOther(columns: string[], comments: string): void {
+  const missing = NEEDED.filter((column) => !columns.includes(column));
+  const unknown = columns.filter((column) => !(COLUMNS as readonly string[]).includes(column));
+  if (missing.length || unknown.length) {
+    throw new Error(`Columns ${columns.join(", ").slice(0, 80)} found; expected ${NEEDED.join(", ")}, and of ${COLUMNS.join(", ")} no others. ${ELSEWHERE}`);
+  }
+  if (!/pixel-origin\s*[=:]\s*centre\b/i.test(comments) || !/heights\s*[=:]\s*ellipsoid/i.test(comments)) {
+    throw new Error(`A first line “${ORIGIN}” expected: it says what line and height mean. ${ELSEWHERE}`);
+  }
 }
 
 /** A name for a file and for a list: without separators, and unlike those of other marks. */

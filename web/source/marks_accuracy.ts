@@ -30,6 +30,17 @@ export class StatedFields {
     );
   }
 
+  /** Fill the fields with what was stated earlier; what is missing stays as it is. */
+  set value({ sigma_m, mark_sigma_px, frame_sigma_m }: Stated) {
+    const { ground, up, pick, frame, frameUp } = this.inputs;
+    const put = (input: HTMLInputElement, value: number | undefined): void => void (value === undefined || (input.value = String(value)));
+    put(ground, sigma_m?.[0]);
+    put(up, sigma_m?.[1]);
+    put(pick, mark_sigma_px);
+    put(frame, frame_sigma_m?.[0]);
+    put(frameUp, frame_sigma_m?.[1]);
+  }
+
   /** The pairs and values that are complete. */
   get value(): Stated {
     const { ground, up, pick, frame, frameUp } = this.inputs;

@@ -8,6 +8,8 @@ import type { Tiles } from "./tiles";
 const STEP_PX = 12;
 const FINE_STEP_PX = 1;
 const DRAG_PX = 4;
+/** From the edge of a pixel of the screen, as a click has it, to its middle. */
+const MIDDLE_PX = 0.5;
 const ZOOM = 1.5;
 const LARGEST_SCALE = 16;
 const EDGE_PX = 24;
@@ -116,7 +118,7 @@ export class Viewer {
     canvas.addEventListener("pointerup", (event) => {
       const click = this.drag && !this.drag.moved;
       this.drag = null;
-      if (click) this.add([event.offsetX, event.offsetY]);
+      if (click) this.add([event.offsetX + MIDDLE_PX, event.offsetY + MIDDLE_PX]);
     });
     canvas.addEventListener("pointercancel", () => (this.drag = null));
     canvas.addEventListener("pointerleave", () => this.move(null));
