@@ -77,6 +77,7 @@ class Settings(BaseSettings):
         scene_folder: scenes below it can be registered without an upload; None allows none.
         reference_folder: reference images and terrains below it can be added; None allows none.
         ingest_folder: block folders below it can be ingested through the API; None allows none.
+        catalogues: STAC catalogues that bases are made from through the API; none: no bases are made.
         quota_storage_bytes: largest total size of all that one token has in the storage.
         quota_open_uploads: largest number of resumable uploads of one token that are not complete.
         quota_jobs: largest number of open jobs of one token.
@@ -132,6 +133,7 @@ class Settings(BaseSettings):
     scene_folder: Path | None = None
     reference_folder: Path | None = None
     ingest_folder: Path | None = None
+    catalogues: Annotated[tuple[str, ...], NoDecode] = ()
     quota_storage_bytes: int = Field(default=1024 * GIBIBYTE, ge=0)
     quota_open_uploads: int = Field(default=100, ge=0)
     quota_jobs: int = Field(default=100, ge=0)
@@ -159,7 +161,7 @@ class Settings(BaseSettings):
     log_format: Literal["text", "json"] = "text"
     log_level: Literal["debug", "info", "warning", "error"] = "info"
 
-    @field_validator("cors_origins", "trusted_hosts", "trusted_proxies", mode="before")
+    @field_validator("catalogues", "cors_origins", "trusted_hosts", "trusted_proxies", mode="before")
     @classmethod
     def _split(cls, value: object) -> object:
         return (

@@ -82,8 +82,8 @@ class OpenArchive:
         return self.dates[f"{image.acquired:%Y%m%d}"].error_m
 
 
-def make_archive(folder: Path, seed: int = 7) -> OpenArchive:
-    """Simulate the archive and write its files."""
+def make_archive(folder: Path, seed: int = 7, dates: int = DATES) -> OpenArchive:
+    """Simulate the archive, or its first dates, and write its files."""
     rng = np.random.default_rng(seed)
     world = make_world(rng, 8_000.0, POSTING_M, 150.0, centre_lon_lat=CENTRE, region_m=2_500.0)
     east_m, north_m = metres_per_degree(CENTRE[1], 0.0)
@@ -91,7 +91,7 @@ def make_archive(folder: Path, seed: int = 7) -> OpenArchive:
     region = (CENTRE[0] - reach[0], CENTRE[1] - reach[1], CENTRE[0] + reach[0], CENTRE[1] + reach[1])
     (folder / "data").mkdir(parents=True)
     archive = OpenArchive(folder, world, {}, region, folder / "geoid.gtx")
-    for date in _dates(rng):
+    for date in _dates(rng)[:dates]:
         name = f"{date.moment:%Y%m%d}"
         archive.dates[name] = date
         light = light_of(world, date, rng)
@@ -284,6 +284,7 @@ class Faults:
         uses: requests after which a signature expires; 0: addresses have none.
         broken: names of files whose pixels are damaged.
         gone: names of files that are not there.
+        is_plain: addresses of items stay as they are.
     """
 
     busy: int = 0
@@ -291,6 +292,7 @@ class Faults:
     uses: int = 0
     broken: tuple[str, ...] = ()
     gone: tuple[str, ...] = ()
+    is_plain: bool = False
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -355,7 +357,9 @@ class _Handler(BaseHTTPRequestHandler):
     def _signed(self, item: dict[str, Any]) -> dict[str, Any]:
         query = f"?sig={self.signature[0]}" if self.faults.uses else ""
         assets = {
-            name: {**asset, "href": f"{self.base}/{asset['href']}{query}"}
+            name: asset
+            if self.faults.is_plain
+            else {**asset, "href": f"{self.base}/{asset['href']}{query}"}
             for name, asset in item["assets"].items()
         }
         links = [{"rel": "self", "href": f"{self.base}/items/{item['id']}"}]

@@ -39,6 +39,7 @@ from amers.app.errors import (
 from amers.app.outages import outage_of
 from amers.app.storage import Storage
 from amers.app.usecases import quotas, storage_identity
+from amers.app.usecases.base.job import MAKE_BASE
 from amers.app.usecases.blocks.export import EXPORT_BLOCK
 from amers.app.usecases.blocks.ingestion import INGEST_BLOCK
 from amers.app.usecases.blocks.quality_job import ASSESS_BLOCK
@@ -74,6 +75,7 @@ PROCESSES: dict[str, Process] = {
         EXPORT_BLOCK,
         ASSESS_BLOCK,
         RENEW_BLOCK,
+        MAKE_BASE,
     )
 }
 LONGEST_KEY = 200

@@ -342,7 +342,7 @@ def test_an_update_reads_new_dates_alone_and_drops_what_they_contradict(archive,
     points = read_block(tmp_path / "c").points.lon_lat_h
     off_m = np.linalg.norm((points - gone)[:, :2] * metres_per_degree(CENTRE[1], 0.0), axis=1)
     assert off_m.min() > 100.0, "the point that vanished is still there"
-    assert len(points) >= len(first.points) - 4
+    assert len(points) > 0.6 * len(first.points), "chips of 1 km beside it show it, too"
     again = amers_here(
         ["base", "update", work, "--catalogue", str(old.folder), "-o", tmp_path / "d"], os.environ
     )
@@ -361,6 +361,19 @@ def test_the_archive_can_be_a_folder_and_the_region_a_file_or_a_scene(archive, t
     assert planned.area_km2 == pytest.approx((SIZE_PX * GSD_M / 1000.0) ** 2, rel=0.1)
 
 
+def test_a_catalogue_on_a_server_leads_to_no_file_of_this_machine(archive, tmp_path) -> None:
+    local = f"file://{archive.folder / 'data' / 'dem.tif'}"
+    items = [
+        {**one, "assets": {name: {**asset, "href": local} for name, asset in one["assets"].items()}}
+        for one in archive.items
+    ]
+    hostile = replace(archive, items=items)
+    with running_archive(hostile, Faults(is_plain=True)) as server:
+        request = request_of(archive, server.url, bbox=small_part(archive))
+        with pytest.raises(InputError, match="leads to a file of this machine"):
+            make_base(request, tmp_path / "b", BlockIdentity("b"), FEW)
+
+
 def test_what_is_missing_is_named(archive, tmp_path) -> None:
     with pytest.raises(InputError, match="--area, --bbox or --scene"):
         plan(request_of(archive, "x", bbox=None))
@@ -370,6 +383,13 @@ def test_what_is_missing_is_named(archive, tmp_path) -> None:
         plan(BaseRequest("quickbird", ("x",), bbox=archive.region))
     with pytest.raises(InputError, match="within 180"):
         plan(request_of(archive, "x", bbox=(179.0, 0.0, -179.0, 1.0)))
+    without = [one for one in archive.items if one["collection"] == "sentinel-2-l2a"]
+    lines = tmp_path / "items.ndjson"
+    lines.write_text("\n".join(json.dumps(one) for one in without))
+    with pytest.raises(
+        InputError, match=r"heights of the region: no item of cop-dem-glo-30 .* \(--dem\)"
+    ):
+        plan(request_of(archive, str(lines)))
     with pytest.raises(InputError, match="--catalogue: nothing found"):
         plan(BaseRequest("sentinel-2", (), bbox=archive.region))
     assert making.plan is plan

@@ -35,6 +35,8 @@ from tests.app.surface_world import write_pair
 from tests.app.test_lost_sessions import drawn, limited, new_database
 from tests.app.test_orthorectification import write_inputs
 from tests.app.test_vectors import drawn as drawn_vectors
+from tests.open_archive import CENTRE as OPEN_CENTRE
+from tests.open_archive import make_archive
 from tests.statements import run_sql
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
@@ -43,6 +45,7 @@ LONGEST_S = 240
 MOST_ATTEMPTS = 4
 """Attempts that one lost session may cost, with those of a job that was given back."""
 LEASE_S = 30.0
+BASE_BOX = [OPEN_CENTRE[0] - 0.01, OPEN_CENTRE[1] - 0.01, OPEN_CENTRE[0] + 0.01, OPEN_CENTRE[1] + 0.01]
 
 
 @dataclass(frozen=True)
@@ -77,8 +80,15 @@ def with_jobs(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> Ins
     installations = Installations(cluster, made, new_database(cluster), EMPTY_TEMPLATE)
     dsn = cluster.dsn(installations.filled)
     fill(dsn, made, points=100, size=1200)
+    make_archive(made / "open", dates=3)
     queue_jobs(dsn, made)
     return installations
+
+
+def files_of(place: Place) -> dict[str, str]:
+    """Settings by which jobs find files on the server."""
+    catalogue = place.made / "open" / "items.json"
+    return {"AMERS_INGEST_FOLDER": str(place.made), "AMERS_CATALOGUES": str(catalogue)}
 
 
 def queue_jobs(dsn: str, made: Path) -> None:
@@ -128,6 +138,7 @@ def queue_jobs(dsn: str, made: Path) -> None:
             "export-block": {"bbox": box},
             "assess-block": {"block": "flat"},
             "renew-block": {"block": "flat", "jobs": [done["jobID"]]},
+            "make-base": {"id": "open", "bbox": BASE_BOX, "dates": 2, "geoid": "open/geoid.gtx"},
         }
         assert inputs.keys() == PROCESSES.keys(), "a new kind of job needs inputs here"
         for kind, values in inputs.items():
@@ -154,7 +165,7 @@ def do_job(server: WarmServer, place: Place, direct_dsn: str, job_id: UUID) -> J
     """Do attempts as one worker does, until the job has ended; time passes between them."""
     settings = settings_of(place.dsn, place.made, place.folder / "data")
     environment = {name: place.environment[name] for name in place.environment if "AMERS" in name}
-    elsewhere = ElsewhereServer(server, environment | {"AMERS_INGEST_FOLDER": str(place.made)})
+    elsewhere = ElsewhereServer(server, environment | files_of(place))
     with engine.pooled(direct_dsn, settings) as direct:
         for _ in range(MOST_ATTEMPTS):
             with limited(LONGEST_S):

@@ -56,6 +56,7 @@ def inputs(admin: Caller) -> dict[str, dict[str, Any]]:
         "export-block": {"block": "flat"},
         "assess-block": {"block": "flat"},
         "renew-block": {"block": "flat", "jobs": [scene]},
+        "make-base": {"id": "valley", "bbox": [5.9, 43.5, 6.1, 43.7]},
     }
 
 

@@ -211,13 +211,13 @@ class Finishing:
         """
         making, reader = self.making, self.reader
         with ExitStack() as stack:
-            heights = making.heights(reader.candidates, self.tiles, reader.folder.parent)
             tiles = opened_tiles(self.tiles, self.chosen, reader, stack)
+            heights = making.heights(reader.candidates, self.tiles, reader.folder.parent)
             gsd_m = making.archive.gsd_m
             placed = placed_dates(tiles, heights, gsd_m, part_of(progress, 0.0, 0.2))
             parts = points_of_tiles(placed, heights, reader, self.recent, part_of(progress, 0.2, 0.6))
             frame = Frame.from_sigmas(placed.frames.sigma_m, heights.frame_sigma_m)
-            least_m = 0.7 * spacing_m(making.options, making.archive)
+            least_m = 0.7 * spacing_m(making.options, making.archive, area_km2(making.area))
             points, chips = joined_points(parts, heights, frame, least_m)
             made = _made(making, points, placed, reader, parts)
             metadata = _metadata(identity, making, made, parts[0].production.gsds_m)

@@ -53,7 +53,8 @@ class BaseOptions:
 
     Attributes:
         dates: clear dates that every place needs, over seasons and orbits.
-        spacing_m: one point per square of this side, metres; by default a hundred pixels.
+        spacing_m: one point per square of this side, metres; by default a hundred pixels, less in a
+            small region.
         min_share: least share of the dates showing a point in which it is found, 0 to 1.
         max_cloud: largest cloud cover of an image in its catalogue, percent.
         min_clear: least clear share of an image in the region, by its mask, percent.

@@ -23,6 +23,10 @@ from amers.services.types import Progress, no_progress
 
 CHIP_PX = 101
 """Side of a chip."""
+_USUAL_PX, _LEAST_PX = 100.0, 25.0
+"""Sides of the square of a point: chips of neighbours touch, and overlap by three quarters."""
+_FEWEST_SQUARES = 40.0
+"""A registration needs six points, and a good one twenty, of those that its scene shows."""
 COARSE_FACTOR = 4.0
 """Ground sampling of the coarse chips over that of the fine ones."""
 SECONDS_PER_MEGABYTE = 0.4
@@ -147,6 +151,12 @@ def find_candidates(
             f"{len(request.catalogues)} catalogues"
             + (f"; the first problem: {problems[0]}" if problems else "")
         )
+    if request.terrain is None and not terrain:
+        expected = ", ".join(COPERNICUS_DEM.collections)
+        raise InputError(
+            f"heights of the region: no item of {expected} found in the catalogues; give a catalogue "
+            "that has it (--catalogue), or a terrain (--dem)"
+        )
     ordered = [found[name] for name in sorted(found)]
     images, items = [image for image, _ in ordered], [item for _, item in ordered]
     heights = [terrain[name] for name in sorted(terrain)]
@@ -235,7 +245,7 @@ def plan_base(
             size = pixels * archive.bytes_per_px * (1.02 if archive.mask else 1.0)
             dates.append(PlannedDate(number, tile.tile, pixels, math.ceil(size)))
     size_km2 = area_km2(area)
-    points = math.ceil(size_km2 / (spacing_m(options, archive) / 1000.0) ** 2)
+    points = math.ceil(size_km2 / (spacing_m(options, archive, size_km2) / 1000.0) ** 2)
     terrain = size_km2 * 1.3e6 / COPERNICUS_DEM.gsd_m**2 * COPERNICUS_DEM.bytes_per_px
     terrain_bytes = math.ceil(terrain) if reads_terrain else 0
     mean_dates = len(dates) / max(1, len(tiles))
@@ -244,9 +254,11 @@ def plan_base(
     return BasePlan(size_km2, tiles, dates, terrain_bytes, full, points, seconds)
 
 
-def spacing_m(options: BaseOptions, archive: Archive) -> float:
-    """Side of the square of a point."""
-    return options.spacing_m or 100.0 * archive.gsd_m
+def spacing_m(options: BaseOptions, archive: Archive, size_km2: float) -> float:
+    """Side of the square of a point: a hundred pixels, less in a region of few such squares."""
+    few_m = 1000.0 * math.sqrt(size_km2 / _FEWEST_SQUARES)
+    most_m, least_m = (count * archive.gsd_m for count in (_USUAL_PX, _LEAST_PX))
+    return options.spacing_m or max(least_m, min(most_m, few_m))
 
 
 def _day(text: str | None) -> datetime | None:

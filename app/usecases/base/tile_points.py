@@ -171,7 +171,9 @@ def points_of_tiles(
     Raises:
         NotEnoughPoints: no tile has any.
     """
-    gsd_m, step_m = reader.archive.gsd_m, spacing_m(reader.options, reader.archive)
+    gsd_m = reader.archive.gsd_m
+    size_km2 = sum(area_km2(tile.area.polygon) for tile in placed.tiles)
+    step_m = spacing_m(reader.options, reader.archive, size_km2)
     options = _point_options(reader.options, gsd_m, step_m)
     if placed.frames.orbits > 1:
         options = replace(options, local_sigma_px=_LOCAL_SIGMA_PX)

@@ -114,7 +114,9 @@ def _with_newer(making: Making, old: Candidates, before: _Before, progress: Prog
     """The candidates with those that catalogues have since the last date of the base."""
     used = {name for of_tile in before.images.values() for name in of_tile}
     newest = max(image.acquired for image in old.images if image.id in used)
-    request = replace(making.request, since=f"{newest:%Y-%m-%d}")
+    # The heights are in the work folder already.
+    heights = making.request.terrain or TerrainFile(Path())
+    request = replace(making.request, since=f"{newest:%Y-%m-%d}", terrain=heights)
     found = replace(making, request=request).candidates(progress)
     known = {image.id for image in old.images}
     rows = [row for row, image in enumerate(found.images) if image.id not in known]

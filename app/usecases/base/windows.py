@@ -206,11 +206,7 @@ def read_terrain_windows(
                 continue
         progress(0.0, f"heights of {number + 1} of {len(candidates.terrain)} tiles")
     if not any(folder.glob("*.tif")):
-        expected = ", ".join(COPERNICUS_DEM.collections)
-        raise InputError(
-            f"heights of the region: no item of {expected} found in the catalogues; give a catalogue "
-            "that has it (--catalogue), or a terrain (--dem)"
-        )
+        raise InputError("heights of the region: the files of the catalogues do not show it; give --dem")
     return folder
 
 
@@ -225,7 +221,13 @@ def _shown(image: Any, tile: TileArea) -> float:
 
 def _place(item: Any, asset: str, name: str) -> FilePlace:
     address = asset_address(item, asset, name)
-    return file_place(address.removeprefix("file://") if address.startswith("file://") else address)
+    place = file_place(address.removeprefix("file://"))
+    if is_address(item["catalogue"]) and isinstance(place, Path):
+        raise FormatError(
+            f"{name}: {asset}: its catalogue on a server leads to a file of this machine; an address "
+            "(https://, s3://) expected"
+        )
+    return place
 
 
 def _signed(item: Any, archive: Archive) -> Any:
