@@ -92,10 +92,12 @@ class PieceKind:
         name = path.name.lower()
         if name.startswith(".") or not name.endswith(self.suffixes) or name.endswith(".vrt"):
             return False
-        band = _BAND.search(path.name) if self.is_deep else None
-        if band is None:
-            return not (self.is_deep and any(part in _NO_IMAGES for part in path.parts))
-        return band[1].upper() == "B04" and band[2] in (None, "_10m")
+        if not self.is_deep:
+            return True
+        if any(part in _NO_IMAGES for part in path.parts):
+            return False
+        band = _BAND.search(path.name)
+        return band is None or (band[1].upper() == "B04" and band[2] in (None, "_10m"))
 
 
 IMAGES = PieceKind("images on a map", IMAGE_SUFFIXES, ("B04", "red", "visual"), is_deep=True)

@@ -197,6 +197,28 @@ def test_heights_come_in_the_same_forms(tmp_path: Path) -> None:
             np.testing.assert_array_equal(terrain.height_m(at), heights_m)
 
 
+@pytest.mark.parametrize(
+    ("path", "is_piece"),
+    [
+        ("S2A_MSIL1C.SAFE/GRANULE/L1C_T33UUU/IMG_DATA/T33UUU_20160608T101032_B04.jp2", True),
+        ("S2A_MSIL1C.SAFE/GRANULE/L1C_T33UUU/IMG_DATA/T33UUU_20160608T101032_B8A.jp2", False),
+        ("S2A_MSIL1C.SAFE/GRANULE/L1C_T33UUU/IMG_DATA/T33UUU_20160608T101032_TCI.jp2", False),
+        ("S2A_MSIL1C.SAFE/GRANULE/L1C_T33UUU/QI_DATA/MSK_QUALIT_B04.jp2", False),
+        ("S2A_MSIL2A.SAFE/GRANULE/L2A_T33UUU/IMG_DATA/R10m/T33UUU_20160608T101032_B04_10m.jp2", True),
+        ("S2A_MSIL2A.SAFE/GRANULE/L2A_T33UUU/IMG_DATA/R20m/T33UUU_20160608T101032_B04_20m.jp2", False),
+        ("S2A_MSIL2A.SAFE/GRANULE/L2A_T33UUU/IMG_DATA/R20m/T33UUU_20160608T101032_SCL_20m.jp2", False),
+        ("S2A_OPER_PRD.SAFE/GRANULE/T33UUU/IMG_DATA/S2A_OPER_MSI_L1C_TL_A005_T33UUU_B04.jp2", True),
+        ("orthos/sheet_12.tif", True),
+        ("orthos/sheet_12.tif.aux.xml", False),
+        ("orthos/sheets.vrt", False),
+    ],
+)
+def test_the_red_band_of_products_of_sentinel_2_is_taken_by_its_delivered_name(
+    path: str, is_piece: bool
+) -> None:
+    assert IMAGES.fits(Path(path)) is is_piece
+
+
 def with_a_wrong_item(folder: Path) -> Path:
     path = folder / "items.ndjson"
     path.write_text(json.dumps({"type": "Feature", "stac_version": "1.0.0", "id": "x", "assets": {}}))
