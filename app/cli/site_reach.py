@@ -87,9 +87,9 @@ def reach(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure how far each known site carries: the block with one of them, the others as check.
+    """Measure how far each of several known sites carries alone.
 
-    Each file of marks with known ground is a site; points without known ground tie the images, which are
+    A block of the images knows one site, and the others check it. Each file of marks with known ground is a site; points without known ground tie the images, which are
     adjusted with all sites, then with each alone.
     """
     of_file = stated_by_caller(
