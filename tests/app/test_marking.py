@@ -11,6 +11,8 @@ from fastapi.testclient import TestClient
 
 from amers.app.api.marks import MOST_MARKS, MOST_PLACES
 from amers.app.config import Settings
+from amers.app.usecases.marked_files import PointStatements
+from amers.app.usecases.marking import HeightSource, Place, SetMark, adjust_set_marks
 from amers.services.formats.images.scenes import read_scene
 from amers.services.formats.sensor_models.scene_model import format_scene_model, parse_scene_model
 from amers.services.types import Array
@@ -179,3 +181,26 @@ def test_the_document_of_a_model_has_the_model_as_delivered(world: FlatWorld) ->
     assert np.array_equal(again.model.project(ground), scene.model.project(ground))
     assert again.image.shape == scene.image.shape
     assert again.sigma_m == SIGMA_M
+
+
+def test_marks_in_an_ortho_image_need_no_heights(tmp_path: Path) -> None:
+    """A map grid that is moved by 12 m comes back, from a document of its model."""
+    path, moved_m = tmp_path / "ortho.tif", np.array([12.0, -5.0])
+    grid = rasterio.transform.from_origin(700_000.0, 4_800_000.0, 2.0, 2.0)
+    profile = {"driver": "GTiff", "width": 400, "height": 300, "count": 1, "dtype": "uint8"}
+    with rasterio.open(path, "w", **profile, crs="EPSG:32631", transform=grid) as file:
+        file.write(np.ones((300, 400), dtype=np.uint8), 1)
+    scene = parse_scene_model(format_scene_model(read_scene(path, sigma_m=10.0)), "scene_model.json")
+    picked = np.array([[50.0, 60.0], [250.0, 90.0], [120.0, 350.0]])
+    ground = scene.model.locate(picked + moved_m / 2.0, np.zeros(3))
+    marks = [
+        SetMark(f"M{number}", *mark, *place[:2])
+        for number, (mark, place) in enumerate(zip(picked.tolist(), ground.tolist(), strict=True))
+    ]
+    stated = PointStatements(sigma_m=(0.1, 0.1), mark_sigma_px=0.2)
+    places = [Place(line=150.0, sample=200.0)]
+    adjusted = adjust_set_marks(scene, marks, places, HeightSource(), stated)
+    assert [mark.status for mark in adjusted.results] == ["used"] * 3
+    true = scene.model.locate(np.array([[150.0, 200.0]]) + moved_m / 2.0, np.zeros(1))[0]
+    assert abs(adjusted.places[0].lon - true[0]) < 1e-6
+    assert abs(adjusted.places[0].lat - true[1]) < 1e-6
