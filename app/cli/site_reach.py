@@ -89,9 +89,9 @@ def reach(
 ) -> None:
     """Measure how far each of several known sites carries alone.
 
-    A block of the images knows one site, and the others check it. Each file of marks with known ground is
-    a site; points without known ground tie the images, which are adjusted with all sites, then with each
-    alone.
+    A block of the images knows one site, and the others check it. Each file of marks with known ground
+    is a site; points without known ground tie the images, which are adjusted with all sites, then with
+    each alone.
     """
     of_file = stated_by_caller(
         stated.geoid or stated.vertical, stated.crs, stated.columns, stated.sigma_axes
