@@ -80,6 +80,10 @@ class CoverageError(InputError):
     """Two data sets that must overlap do not."""
 
 
+class OtherGround(CoverageError):
+    """Control lies so far from a scene that it is that of other ground."""
+
+
 class VerticalDatumError(InputError):
     """Heights whose vertical datum is unknown or not supported."""
 

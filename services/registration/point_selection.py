@@ -3,8 +3,9 @@
 import numpy as np
 
 from amers.services.conventions import MAX_ERROR_SIGMAS
-from amers.services.errors import CoverageError
-from amers.services.imagery.scene import Scene, scene_gsd_m
+from amers.services.errors import CoverageError, OtherGround
+from amers.services.geodesy import ecef_from_lon_lat_h
+from amers.services.imagery.scene import Scene, scene_centre, scene_gsd_m
 from amers.services.matching.chip_extent import MIN_VISIBLE_SIDE
 from amers.services.matching.predict import in_image, spread_over_image
 from amers.services.registration.chip_selection import has_chip, visibility_probability
@@ -17,11 +18,17 @@ MIN_RELATIVE_PROBABILITY = 0.5
 where fewer others exist than are tried."""
 
 
+_OTHER_GROUND_M = 5000.0
+"""Distance from a scene, beyond half its diagonal, from which on points are those of other ground:
+errors of models up to it are searched."""
+
+
 def visible_points(scene: Scene, points: ControlPoints) -> IntArray:
     """Rows of the points that a scene may show within the largest error of its model, ascending.
 
     Raises:
         CoverageError: there is none.
+        OtherGround: they lie farther away than any error of a model that is searched.
     """
     if len(points) == 0:
         raise CoverageError("no control point lies in the footprint of the scene")
@@ -29,12 +36,36 @@ def visible_points(scene: Scene, points: ControlPoints) -> IntArray:
     predicted = scene.model.project(points.lon_lat_h)
     visible = np.flatnonzero(in_image(predicted, scene.image.shape, margin_px))
     if len(visible) == 0:
-        raise CoverageError(
-            f"none of the {len(points)} control points lies in the scene, "
-            f"even with {margin_px:.0f} px of margin for its accuracy of {scene.sigma_m:g} m: state a "
-            "larger `sigma_m` when the model may be further off"
-        )
+        raise _none_visible(scene, points)
     return visible
+
+
+def _none_visible(scene: Scene, points: ControlPoints) -> CoverageError:
+    """Why a scene shows no point: how far the nearest lies, and what that means."""
+    centre = scene_centre(scene)
+    places = ecef_from_lon_lat_h(np.vstack([centre, points.lon_lat_h]))
+    # Through the Earth: within 1 % up to 3,000 km.
+    away_m = np.linalg.norm(places[1:] - places[0], axis=1)
+    beyond_m = float(away_m.min()) - np.hypot(*scene.image.shape) * scene_gsd_m(scene) / 2.0
+    none = f"none of the {len(points)} control points lies in the scene"
+    if beyond_m <= _OTHER_GROUND_M:
+        return CoverageError(
+            f"{none}, whose model is taken to be accurate to {scene.sigma_m:g} m: the nearest is "
+            f"{away_m.min():.0f} m from its middle; state a larger `sigma_m` when the model may be "
+            "further off"
+        )
+    lon, lat = points.lon_lat_h[int(np.argmin(away_m)), :2].tolist()
+    return OtherGround(
+        f"{none}: the scene lies at {_degrees(*centre[:2].tolist())}, the nearest point at "
+        f"{_degrees(lon, lat)}, {away_m.min() / 1000.0:,.0f} km away; give points of its ground, or the "
+        "model of this image"
+    )
+
+
+def _degrees(lon: float, lat: float) -> str:
+    """A position as people write it."""
+    north, east = "N" if lat >= 0.0 else "S", "E" if lon >= 0.0 else "W"
+    return f"{abs(lat):.2f} {north}, {abs(lon):.2f} {east}"
 
 
 def initial_prediction(scene: Scene, points: ControlPoints) -> Prediction:

@@ -1,6 +1,7 @@
 """The report of a registration that failed: what was tried and where, and what to try next."""
 
 import math
+import shlex
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -11,6 +12,7 @@ from amers.services.errors import (
     CoverageError,
     NoConsensus,
     NotEnoughPoints,
+    OtherGround,
     RescaledImage,
     TurnedImage,
 )
@@ -111,6 +113,8 @@ def next_steps(
         error, (CoverageError, NoConsensus, NotEnoughPoints)
     ):
         return (NextStep("Correct what the reason names, and run the registration again.", command),)
+    if isinstance(error, OtherGround):
+        return _find_control(scene, command)
     if isinstance(error, TurnedImage):
         text = "Turn the image or its model as the reason says, and run the registration again."
         return (NextStep(text, command),)
@@ -180,7 +184,11 @@ def _state_larger(scene: SceneRecord, command: str, stage: SearchStage | None = 
 
 
 def _find_control(scene: SceneRecord, command: str) -> tuple[NextStep, ...]:
-    """Look for points of the ground, or register on something else."""
+    """Look for points of the ground, or register on something else; not in a block that has none."""
+    words = shlex.split(command)
+    if "--block" in words:
+        at = words.index("--block")
+        command = shlex.join(words[:at] + words[at + 2 :])
     west, south = scene.footprint_lon_lat.min(axis=0)
     east, north = scene.footprint_lon_lat.max(axis=0)
     return (

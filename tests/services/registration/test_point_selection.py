@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from amers.services.conventions import CHIP_CENTRE
-from amers.services.errors import CoverageError
+from amers.services.errors import CoverageError, OtherGround
 from amers.services.geodesy import move_metres
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage
@@ -109,8 +109,14 @@ def test_points_are_visible_as_far_as_the_scene_may_be_off() -> None:
 def test_a_scene_beside_all_points_is_refused() -> None:
     scene, points = small_scene(), block()[0]
     elsewhere = replace(points, lon_lat_h=points.lon_lat_h + [0.5, 0.0, 0.0])
-    with pytest.raises(CoverageError, match="lies in the scene, even with"):
+    with pytest.raises(OtherGround, match=r"at 43\.60 N, 5\.40 E, the nearest point at .* \d\d km away"):
         visible_points(scene, elsewhere)
+    near = replace(points, lon_lat_h=points.lon_lat_h + [0.02, 0.0, 0.0])
+    with pytest.raises(
+        CoverageError, match=r"accurate to 60 m: the nearest is \d+ m from its middle"
+    ) as told:
+        visible_points(scene, near)
+    assert not isinstance(told.value, OtherGround)
     with pytest.raises(CoverageError, match="no control point"):
         visible_points(scene, points.take(np.arange(0)))
 

@@ -13,6 +13,7 @@ from amers.services.errors import (
     FormatError,
     NoConsensus,
     NotEnoughPoints,
+    OtherGround,
     RescaledImage,
     TurnedImage,
 )
@@ -164,6 +165,14 @@ def test_without_a_visible_point_the_ground_is_looked_up(report):
     assert lookup.startswith(f"amers points query --bbox {west:.4f},{south:.4f},")
     assert "--reference" in reference
     assert "--sigma-m" in larger
+
+
+def test_points_of_other_ground_are_looked_for_elsewhere_and_not_farther_out(report):
+    command = "amers scene register a.tif --block 'of another country' -o out"
+    steps = [one.command for one in next_steps(OtherGround(""), report.scene, (), command)]
+    assert len(steps) == 2
+    assert not any("--sigma-m" in one or "--block" in one for one in steps)
+    assert steps[1].startswith("amers scene register a.tif -o out --reference")
 
 
 def test_a_stated_accuracy_below_the_smallest_radius_is_raised_beyond_it(report):
