@@ -3,11 +3,12 @@
 import type { Feature, Position } from "geojson";
 import { register } from "./again";
 import { COORDINATE_ZOOM } from "./atlas";
-import { blobUrl, call, get } from "./api";
-import type { AdjustedMark, AdjustedMarks, PlaceOfMarks, PointWithViews, ResultFile, Scene, StatusInfo } from "./api_types";
+import { call, get } from "./api";
+import type { AdjustedMark, AdjustedMarks, PlaceOfMarks, ResultFile, Scene, StatusInfo } from "./api_types";
 import { fill, h, plural, problem } from "./elements";
 import { type Begun, History, type InImage, type Mark, nothingBegun, type OnGround, parseInImage, parseOnGround, readCsv, type State, type Stated, unlike, writeCsv } from "./marks";
 import { notesOn, StatedFields, verdictOn } from "./marks_accuracy";
+import { PointChip, pointOnGround } from "./marks_point";
 import { referenceChoice } from "./marks_reference";
 import { MarksTable } from "./marks_table";
 import { announce, go } from "./page";
@@ -34,6 +35,8 @@ const AROUND_PX = 60;
 /** A model that a job has read: its job, and whether places need heights. */
 interface ReadModel {
   job: string;
+  lines: number;
+  samples: number;
   needsHeights: boolean;
 }
 
@@ -59,15 +62,15 @@ export const showMarking: ShowView = async (place, id) => {
     for (const layer of ["marks", "target", "scenes"] as const) void atlas.show(layer, []);
   });
   const marking = new Marking(place, scene, model, (finished) => new Viewer(section, tiles, finished, signal, OF_IMAGE));
-  await marking.open(state, tiles.index);
+  await marking.open(state);
 };
 
 /** The delivered model of a scene, read anew: its files may have been replaced. */
 async function readModel({ id }: Scene, signal: AbortSignal, report: (job: StatusInfo) => void): Promise<ReadModel> {
   const { jobID: job } = await run("read-model", { scene: id }, signal, report);
-  const results = await get<Record<string, ResultFile>>(`jobs/${job}/results`, signal);
-  const document = await get<object>(results["scene_model.json"]!.href, signal);
-  return { job, needsHeights: "rpc" in document };
+  const results = await get<{ "scene_model.json": ResultFile; lines: number; samples: number }>(`jobs/${job}/results`, signal);
+  const document = await get<object>(results["scene_model.json"].href, signal);
+  return { job, lines: results.lines, samples: results.samples, needsHeights: "rpc" in document };
 }
 
 /** The panel of marks, and what the image and the map show of them. */
@@ -85,7 +88,7 @@ class Marking {
   private readonly prompt = h("p", { class: "prompt", role: "status" });
   private readonly image = h("input", { id: "in-image", autocomplete: "off", spellcheck: false, placeholder: "1204.5, 3310" });
   private readonly ground = h("input", { id: "on-ground", autocomplete: "off", spellcheck: false, placeholder: "5.25331, 43.25242, 120" });
-  private readonly chip = h("div", { class: "chip" });
+  private readonly chip: PointChip;
   private readonly mistake = h("div");
   private readonly undo = h("button", { type: "button", onclick: () => this.back() }, "Undo");
   private readonly redo = h("button", { type: "button", onclick: () => this.forth() }, "Redo");
@@ -111,6 +114,7 @@ class Marking {
     viewer: (finished: (kind: string, vertices: Pixel[]) => void) => Viewer,
   ) {
     this.key = `amers-marks ${scene.id}`;
+    this.chip = new PointChip(place.signal);
     const kept = JSON.parse(sessionStorage.getItem(this.key) ?? "null") as { state: State; stated: Stated } | null;
     this.history = new History(kept?.state ?? { marks: [], begun: nothingBegun([]) });
     this.stated.value = kept?.stated ?? {};
@@ -126,15 +130,16 @@ class Marking {
   }
 
   /** Fill the panel below its heading, in the place of an element, and begin. */
-  async open(instead: HTMLElement, { lines, samples }: { lines: number; samples: number }): Promise<void> {
+  async open(instead: HTMLElement): Promise<void> {
     const { panel, atlas, signal } = this.place;
+    const { lines, samples } = this.model;
     const tools = h("div", { class: "tools", role: "group", "aria-label": "Marks" }, this.undo, this.redo, this.save, this.send);
-    instead.replaceWith(h("div", { class: "marking-panel" }, h("div", {}, this.form(), this.chip, this.mistake), h("div", {}, h("div", { class: "marking-head" }, tools, this.summary), this.table.element, this.onward, this.notes, this.stated.element, this.fileField())));
+    instead.replaceWith(h("div", { class: "marking-panel" }, h("div", {}, this.form(), this.chip.element, this.mistake), h("div", {}, h("div", { class: "marking-head" }, tools, this.summary), this.table.element, this.onward, this.notes, this.stated.element, this.fileField())));
     panel.ownerDocument.addEventListener("keydown", (event) => this.shortcut(event), { signal });
     atlas.pick((position, point) => void this.chooseOnMap(position, point), signal);
     atlas.aim(OF_MAP, signal);
     const corners = [[0, 0], [0, samples - 1], [lines - 1, samples - 1], [lines - 1, 0]].map(([line, sample]) => ({ line, sample }));
-    const { places } = await this.ask(corners);
+    const { places } = await this.ask([], corners);
     this.outline = places.filter(({ lon }) => lon != null).map(({ lon, lat }) => [lon!, lat!]);
     const [[lon, lat] = [NaN, NaN], [otherLon, otherLat] = [NaN, NaN]] = this.outline as [number, number][];
     const side_deg = Math.hypot((otherLon! - lon!) * Math.cos(radians(lat!)), otherLat! - lat!);
@@ -143,7 +148,7 @@ class Marking {
     await atlas.show("scenes", [{ type: "Feature", geometry, properties: { id: this.scene.id, name: this.scene.name } }]);
     atlas.fit(geometry);
     const reference = await referenceChoice(atlas, this.outline, signal);
-    if (reference) this.chip.after(reference);
+    if (reference) this.chip.element.after(reference);
     this.refresh();
     await this.adjust();
   }
@@ -158,7 +163,7 @@ class Marking {
       this.image,
       h("label", { for: "on-ground" }, "Place on the ground", h("span", { class: "quiet" }, " longitude, latitude, height above the ellipsoid")),
       this.ground,
-      h("div", { class: "tools" }, h("button", { type: "submit" }, "Set"), h("button", { type: "button", onclick: () => this.put({ marks: this.marks, begun: nothingBegun(this.marks) }, "Given up.") }, "Give up")),
+      h("div", { class: "tools" }, h("button", { type: "submit" }, "Set"), h("button", { type: "button", onclick: () => this.giveUp() }, "Give up")),
     );
   }
 
@@ -213,11 +218,10 @@ class Marking {
   /** Take a half of a mark, or both; a mark with both and a height is complete. */
   private choose(half: { image?: InImage; ground?: OnGround }): void {
     const begun: Begun = { ...this.begun, ...half };
-    const { image, ground, name, check } = begun;
-    if (image && ground && !this.lacksHeight(ground)) {
-      const mark = { ...ground, ...image, name, check };
-      const marks = [...this.marks, mark];
-      this.put({ marks, begun: nothingBegun(marks) }, `${name} set.`);
+    const { image, ground } = begun;
+    const marks = this.completed(begun);
+    if (marks !== this.marks) {
+      this.put({ marks, begun: nothingBegun(marks) }, `${marks.at(-1)!.name} set.`);
       return;
     }
     this.put({ marks: this.marks, begun }, half.image ? "Place in the image chosen." : half.ground?.point === undefined ? "Place on the ground chosen." : `Control point ${half.ground.point} chosen.`);
@@ -226,6 +230,18 @@ class Marking {
       this.ground.setSelectionRange(this.ground.value.length, this.ground.value.length);
     } else if (image) document.querySelector<HTMLElement>("#map canvas")?.focus({ preventScroll: true });
     else this.viewer.element.focus({ preventScroll: true });
+  }
+
+  /** Forget the half that is chosen; a mark that was to be changed stays as it was. */
+  private giveUp(): void {
+    const marks = this.completed();
+    this.put({ marks, begun: nothingBegun(marks) }, "Given up.");
+  }
+
+  /** The marks, and one with both halves and a height: one that is being changed, or what was chosen last completes. */
+  private completed({ image, ground, name, check } = this.begun): Mark[] {
+    if (!image || !ground || this.lacksHeight(ground)) return this.marks;
+    return [...this.marks, { ...ground, ...image, name: unlike(name, this.marks), check }];
   }
 
   private lacksHeight({ height_m }: OnGround): boolean {
@@ -237,14 +253,26 @@ class Marking {
     try {
       const half: { image?: InImage; ground?: OnGround } = {};
       const { image, ground } = this.begun;
-      if (this.image.value.trim() && this.image.value !== imageText(image)) half.image = parseInImage(this.image.value);
+      if (this.image.value.trim() && this.image.value !== imageText(image)) half.image = this.shown(parseInImage(this.image.value));
       if (this.ground.value.trim() && this.ground.value !== groundText(ground)) half.ground = this.inside(parseOnGround(this.ground.value));
-      if (!half.image && !half.ground) throw new Error(image && ground ? "A height is missing: add it after longitude and latitude." : "A place in the image or on the ground is missing.");
+      if (!half.image && !half.ground && this.completed() === this.marks) throw new Error(image && ground ? "A height is missing: add it after longitude and latitude." : "A place in the image or on the ground is missing.");
       this.choose(half);
       if (half.ground) void this.place.atlas.goTo([half.ground.lon, half.ground.lat]);
     } catch (error) {
       this.refuse(error);
     }
+  }
+
+  /** A typed place in the image. */
+  private shown(image: InImage): InImage {
+    if (this.beyond(image) > 0) throw new Error(`Place in the image: line ${image.line}, sample ${image.sample} found; the image has ${this.model.lines} lines and ${this.model.samples} samples.`);
+    return image;
+  }
+
+  /** How far a place lies beyond the image, pixels. */
+  private beyond({ line, sample }: InImage): number {
+    const { lines, samples } = this.model;
+    return Math.max(-line - CENTRE, line - lines + CENTRE, -sample - CENTRE, sample - samples + CENTRE, 0);
   }
 
   /** A typed place, unless it lies in the scene with longitude and latitude exchanged alone. */
@@ -268,7 +296,7 @@ class Marking {
   private change(mark: Mark): void {
     const { name, check, line, sample, ...ground } = mark;
     const begun: Begun = { name, check, image: { line, sample }, ground };
-    this.put({ marks: this.marks.filter((one) => one !== mark), begun }, `${name}: choose its place in the image or on the ground again.`);
+    this.put({ marks: this.completed().filter((one) => one !== mark), begun }, `${name}: choose its place in the image or on the ground again.`);
     this.look(mark);
     this.image.focus();
   }
@@ -291,14 +319,13 @@ class Marking {
     const { marks, begun } = this;
     this.undo.disabled = !this.history.canUndo;
     this.redo.disabled = !this.history.canRedo;
-    this.save.disabled = this.send.disabled = marks.length === 0;
     this.heading.textContent = `Mark ${begun.name}`;
     this.image.value = imageText(begun.image);
     this.ground.value = groundText(begun.ground);
     this.prompt.textContent = this.promptText();
     this.table.show(marks, this.results);
     this.drawMarks();
-    void this.drawChip(begun.ground?.point);
+    void this.chip.show(begun.ground?.point);
   }
 
   private promptText(): string {
@@ -335,22 +362,6 @@ class Marking {
     if (!begun.image) void this.place.atlas.show("target", []);
   }
 
-  /** The chip of a control point, as a help to find the same place in the image. */
-  private async drawChip(point: number | undefined): Promise<void> {
-    if (this.chip.dataset["point"] === String(point)) return;
-    this.chip.dataset["point"] = String(point);
-    fill(this.chip);
-    if (point === undefined) return;
-    const { signal } = this.place;
-    try {
-      const src = await blobUrl(`collections/points/items/${point}/chips/0?f=png`, signal);
-      if (this.chip.dataset["point"] !== String(point)) return;
-      fill(this.chip, h("figure", {}, h("img", { src, alt: `Chip of control point ${point}`, width: 101, height: 101 }), h("figcaption", {}, `Control point ${point}: the place is the middle of its chip, north is up.`)));
-    } catch (error) {
-      if (!signal.aborted && this.chip.dataset["point"] === String(point)) fill(this.chip, problem(error));
-    }
-  }
-
   /** Let the service adjust the model on the marks; only the last of several requests counts. */
   private async adjust(): Promise<void> {
     sessionStorage.setItem(this.key, JSON.stringify({ state: this.history.now, stated: this.stated.value }));
@@ -359,8 +370,10 @@ class Marking {
     this.request.abort();
     const request = (this.request = new AbortController());
     this.summary.setAttribute("aria-busy", "true");
+    // A file has the heights of the reply.
+    this.save.disabled = this.send.disabled = true;
     try {
-      const reply = await this.ask(asked, AbortSignal.any([request.signal, this.place.signal]));
+      const reply = await this.ask(this.marks, asked, AbortSignal.any([request.signal, this.place.signal]));
       if (request.signal.aborted) return;
       this.results = new Map(reply.marks.map((mark) => [mark.name, mark]));
       this.next = reply.next_mark;
@@ -369,6 +382,7 @@ class Marking {
       fill(this.summary, verdictOn(reply));
       fill(this.notes, ...notesOn(reply, this.model.needsHeights));
       this.onward.hidden = this.next?.line == null;
+      this.save.disabled = this.send.disabled = this.marks.length === 0;
       if (reply.places[0]) this.expect(reply.places[0]);
     } catch (error) {
       if (request.signal.aborted || this.place.signal.aborted) return;
@@ -380,8 +394,8 @@ class Marking {
     this.summary.setAttribute("aria-busy", "false");
   }
 
-  private async ask(places: object[], signal: AbortSignal = this.place.signal): Promise<AdjustedMarks> {
-    const marks = this.marks.map(({ point: _, ...mark }) => mark);
+  private async ask(set: Mark[], places: object[], signal: AbortSignal = this.place.signal): Promise<AdjustedMarks> {
+    const marks = set.map(({ point: _, ...mark }) => mark);
     const body = JSON.stringify({ marks, places, ...this.stated.value });
     const reply = await call(`jobs/${this.model.job}/marks`, { method: "POST", body, headers: { "Content-Type": "application/json" }, signal });
     const adjusted = (await reply.json()) as AdjustedMarks;
@@ -398,11 +412,11 @@ class Marking {
       this.prompt.textContent = "Now the same place on the map: it is expected in the circle in its middle.";
       return;
     }
-    if (line == null || sample == null) {
-      this.prompt.textContent = "The image does not show this place.";
+    const radius = CE90_SIGMAS * (sigma ?? AROUND_PX);
+    if (line == null || sample == null || this.beyond({ line, sample }) > radius) {
+      this.prompt.textContent = `${this.chosen}The image does not show this place.`;
       return;
     }
-    const radius = CE90_SIGMAS * (sigma ?? AROUND_PX);
     const expected: Expected = { at: pixel({ line, sample }), radius };
     this.viewer.show({ expected });
     this.viewer.goTo({ ...expected, radius: Math.max(radius, AROUND_PX) });
@@ -445,14 +459,6 @@ class Marking {
       this.send.disabled = false;
     }
   }
-}
-
-/** The ground of a control point, with its sigmas. */
-async function pointOnGround(point: number, signal: AbortSignal): Promise<OnGround> {
-  const { geometry, properties } = await get<PointWithViews>(`collections/points/items/${point}`, signal);
-  const [lon, lat, height_m] = geometry.coordinates as [number, number, number];
-  const { sigma_east_m: east, sigma_north_m: north, sigma_up_m: up } = properties;
-  return { lon, lat, height_m, sigma_m: [Math.max(east!, north!), up!], point };
 }
 
 /** Zoom at which a pixel of the map is as large as one of so many degrees of a great circle at a latitude. */
