@@ -280,7 +280,7 @@ class Faults:
 
     Attributes:
         busy: replies of 429 that are left for searches.
-        failing: replies of 503 that are left for files.
+        failing: replies of 503 and 429 that are left for files.
         uses: requests after which a signature expires; 0: addresses have none.
         broken: names of files whose pixels are damaged.
         gone: names of files that are not there.
@@ -369,7 +369,7 @@ class _Handler(BaseHTTPRequestHandler):
         with self.lock:
             if self.faults.failing > 0:
                 self.faults.failing -= 1
-                self._send(503, b"")
+                self._send(429 if self.faults.failing % 2 else 503, b"")
                 return
             signature = parse_qs(urlsplit(self.path).query).get("sig", [""])[0]
             if self.faults.uses:

@@ -87,7 +87,7 @@ def base(
     block = tmp_path_factory.mktemp("base") / "valley"
     broken = f"{archive.items[40]['id']}_red.tif"
     gone = f"{archive.items[30]['id']}_red.tif"
-    faults = Faults(busy=2, failing=3, uses=25, broken=(broken,), gone=(gone,))
+    faults = Faults(busy=2, failing=4, uses=25, broken=(broken,), gone=(gone,))
     with running_archive(archive, faults) as server:
         bbox = [f"{value:.7f}" for value in archive.region]
         words = ["--bbox", *bbox, "--from", "sentinel-2", "--catalogue", server.url]
@@ -109,6 +109,7 @@ def test_one_command_makes_a_base_from_a_catalogue_with_faults(archive, base) ->
     assert len({int(date[5:7]) % 12 // 3 for date in made["dates"]}) == 4
     assert made["points_per_km2"] >= 0.5
     assert made["bytes_read"] > 0
+    assert len(made["left_out"]) == 2, "the damaged file and the missing one"
     document = json.loads((block / "block.json").read_text())
     assert "Contains modified Copernicus Sentinel data 2021-2022" in json.dumps(document)
     assert not block.with_name("valley.work").exists()

@@ -2,6 +2,7 @@
 
 import json
 import re
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,6 +35,8 @@ from amers.services.production.date_choice import TileArea
 from amers.services.types import Progress, no_progress
 
 _Read = TypeVar("_Read")
+_PAUSES_S = (0.5, 2.0, 8.0)
+"""Until an image is read again, whose server gave no usable reply; 5xx was tried again before."""
 _MOST_SILENT = 3
 """Images in a row that no server gives, after which the work stops: the network is gone."""
 
@@ -88,7 +91,7 @@ class WindowReader:
             try:
                 stated = self._read(tile, number)
                 self._silent = 0
-            except NoUsableReply as error:
+            except (NoUsableReply, AccessRefused) as error:
                 return self._without_reply(error)
             except (FormatError, CoverageError) as error:
                 stated = {"refused": str(error)}
@@ -103,7 +106,7 @@ class WindowReader:
         self.progress(done, f"{self._taken} images, {self.bytes / 1e6:.1f} MB read")
         return True
 
-    def _without_reply(self, error: NoUsableReply) -> bool:
+    def _without_reply(self, error: FormatError) -> bool:
         """Go on with another image for a while; nothing is remembered, so that it is tried again."""
         self._silent += 1
         if self._silent >= _MOST_SILENT:
@@ -150,6 +153,9 @@ def with_fresh_addresses(
 ) -> _Read:
     """What is read of an item, once more with new addresses where a server refuses the old ones.
 
+    A server that gives no usable reply, such as 429, is asked again after pauses; ranges that were read
+    stay in memory.
+
     Args:
         items: of the archive; the one that is read is replaced by its new state.
         number: of the item.
@@ -162,13 +168,22 @@ def with_fresh_addresses(
     if archive.sign:
         items[number] = _signed(items[number], archive)
     try:
-        return read(items[number])
+        return _patiently(read, items[number])
     except AccessRefused:
         fresh = _signed(items[number], archive) if archive.sign else refreshed(items[number])
         if fresh is None:
             raise
         items[number] = fresh
-        return read(fresh)
+        return _patiently(read, fresh)
+
+
+def _patiently(read: Callable[[Any], _Read], item: Any) -> _Read:
+    for pause_s in _PAUSES_S:
+        try:
+            return read(item)
+        except NoUsableReply:
+            time.sleep(pause_s)
+    return read(item)
 
 
 def refreshed(item: Any) -> Any | None:
