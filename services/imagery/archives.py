@@ -52,6 +52,8 @@ class Archive:
             `offset_applied` is true.
         offset_since: processing baseline.
         offset_applied: name of the property.
+        quality: name of the property whose value must be one of `qualities`, where an item has it.
+        qualities: for which `accuracy` holds.
         accuracy: statements of the producer, by rising baseline.
         bytes_per_px: of the compressed image, for plans.
         attribution: words that the terms of the data ask for; {years} is replaced.
@@ -72,6 +74,8 @@ class Archive:
     offset: float = 0.0
     offset_since: str = ""
     offset_applied: str = ""
+    quality: str = ""
+    qualities: tuple[str, ...] = ()
     accuracy: tuple[StatedAccuracy, ...] = ()
     bytes_per_px: float = 1.5
     attribution: str = ""
@@ -182,6 +186,8 @@ LANDSAT = Archive(
     mask="qa_pixel",
     hidden_bits=(0, 1, 2, 3, 4, 5, 7),
     gsd_m=30.0,
+    quality="landsat:collection_category",
+    qualities=("T1",),
     accuracy=(StatedAccuracy(12.0 / math.sqrt(2.0)),),
     bytes_per_px=1.4,
     attribution="Landsat images courtesy of the U.S. Geological Survey",

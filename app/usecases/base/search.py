@@ -118,14 +118,15 @@ def find_candidates(
     wide = widened(area, 2.0 * COPERNICUS_DEM.gsd_m)
     box = shapely.bounds(wide).tolist()
     since = _day(request.since)
+    # Items of a terrain have the days of its production, which are before any `since`.
+    first = None if request.terrain is None else since
     found: dict[str, tuple[ArchiveImage, Any]] = {}
     terrain: dict[str, Any] = {}
     problems: list[str] = []
     for source in request.catalogues:
         wanted = archive.collections + (() if request.terrain else COPERNICUS_DEM.collections)
-        # Dates of a terrain are those of its production, before any `since`.
         try:
-            catalogue = read_catalogue(source, box, None, progress, elsewhere=True, collections=wanted)
+            catalogue = read_catalogue(source, box, first, progress, elsewhere=True, collections=wanted)
         except NoItems as error:
             problems.append(str(error))
             continue

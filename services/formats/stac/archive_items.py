@@ -41,6 +41,12 @@ def archive_image(item: Any, archive: Archive, source: str) -> ArchiveImage:
     asset_address(item, archive.image, source)
     properties = item["properties"]
     product = f"{properties.get('s2:product_uri') or name}_"
+    quality = properties.get(archive.quality)
+    if quality is not None and quality not in archive.qualities:
+        raise FormatError(
+            f"{source}: item {name!r:.80}: {archive.quality}: {quality!r:.40} found, "
+            f"{' or '.join(archive.qualities)} expected: the accuracy of others is not stated"
+        )
     baseline = _text(properties, "s2:processing_baseline", "processing:version")
     if not baseline and (found := _BASELINE.search(product)):
         baseline = f"{found[1]}.{found[2]}"

@@ -98,7 +98,7 @@ def read_catalogue(
         collections: ids, which a search API is asked for; all by default.
 
     Raises:
-        NoItems: the source has no item.
+        NoItems: the source has no item, or none since the time.
         FormatError: the source is no catalogue, or none of its items can be used.
     """
     query = {} if box is None else {"bbox": ",".join(f"{value:.6f}" for value in box)}
@@ -156,7 +156,7 @@ class _Reader:
         source = without_query(source)
         if not self._images:
             if self._older:
-                raise FormatError(
+                raise NoItems(
                     f"{source}: no item to choose from: {self._older} are before the first time asked "
                     f"for, {self._bad} cannot be used; state an earlier time (--since)"
                 )

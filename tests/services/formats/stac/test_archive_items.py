@@ -75,6 +75,9 @@ def test_a_row_of_landsat_is_a_tile() -> None:
     scene = item("LC08_L2SP_195030", **{"landsat:wrs_path": "195", "landsat:wrs_row": "030"})
     image = archive_image({**scene, "collection": "landsat-c2-l2"}, LANDSAT, "test")
     assert (image.tile, image.orbit) == ("195-030", "195")
+    scene["properties"]["landsat:collection_category"] = "T2"
+    with pytest.raises(FormatError, match="collection_category: 'T2' found, T1 expected"):
+        archive_image({**scene, "collection": "landsat-c2-l2"}, LANDSAT, "test")
 
 
 def test_items_of_others_and_without_the_asset_are_refused() -> None:
