@@ -31,9 +31,10 @@ COARSE_FACTOR = 4.0
 """Ground sampling of the coarse chips over that of the fine ones."""
 SECONDS_PER_MEGABYTE = 0.4
 """Of a plan: 20 Mbit/s, a slow line of an office."""
-SECONDS_PER_POINT_AND_DATE = 0.08
-"""Of a plan, of one core: three corners searched in a date, and two chips. Measured on the simulated
-archive of `tests/app/test_base.py`; docs/methods/base.md has the command."""
+SECONDS_PER_POINT_AND_DATE = 0.02
+"""Of a plan, of one core: three corners searched in a date, and two chips. `amers base make` took 0.008 for
+the squares of Berlin (`tests/journeys/test_real_base.py`) and 0.018 for those of a simulated archive
+(`tests/app/test_base_scenes.py`)."""
 
 
 @dataclass(frozen=True)
