@@ -32,8 +32,8 @@ COARSE_FACTOR = 4.0
 SECONDS_PER_MEGABYTE = 0.4
 """Of a plan: 20 Mbit/s, a slow line of an office."""
 SECONDS_PER_POINT_AND_DATE = 0.02
-"""Of a plan, of one core: three corners searched in a date, and two chips. `amers base make` took 0.008 for
-the squares of Berlin (`tests/journeys/test_real_base.py`) and 0.018 for those of a simulated archive
+"""Of a plan, of one core: three corners searched in a date, and two chips. A base took 0.008 for the
+squares of Berlin (`tests/journeys/test_real_base.py`) and 0.018 for those of a simulated one
 (`tests/app/test_base_scenes.py`)."""
 
 
