@@ -1,10 +1,11 @@
-"""Make the pictures of the README from a folder of `make demo`: the head of its report, and the map.
+"""Make the pictures of the documents from a folder of `make demo`: report, map and marks.
 
     python scripts/make_pictures.py FOLDER
 
 Chromium draws them (`scripts/ensure-chromium`); the map needs the page (`make page`).
 """
 
+import json
 import os
 import shutil
 import socket
@@ -21,16 +22,19 @@ from playwright.sync_api import Page, sync_playwright
 
 PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
 SIZE = {"width": 1120, "height": 700}
+WIDE = {"width": 1400, "height": 920}
 QUALITY = 80
 PATIENCE_S = 120.0
 DRAWING_MS = 10_000.0
 """Time for the map to move and to draw, without a graphics card."""
+MARKS = 6
+WRONG_PX = 25.0
 
 
 def main(folder: Path) -> None:
-    """Write both pictures into docs/pictures."""
+    """Write all pictures into docs/pictures."""
     PICTURES.mkdir(exist_ok=True)
-    with sync_playwright() as driver, service_of(folder / "block") as address:
+    with sync_playwright() as driver, service_of(folder / "block") as (address, secret):
         software_drawing = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
         browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=software_drawing)
         page = browser.new_page(viewport=SIZE, color_scheme="light")
@@ -42,7 +46,40 @@ def main(folder: Path) -> None:
         page.wait_for_load_state("networkidle")
         page.wait_for_timeout(DRAWING_MS)
         keep(page, "map.jpg")
+        page.set_viewport_size(WIDE)
+        mark(page, address, secret, folder)
+        keep(page, "marks.jpg")
         browser.close()
+
+
+def mark(page: Page, address: str, secret: str, folder: Path) -> None:
+    """Set marks on control points, one of them wrong, and choose another point on the map."""
+    headers = {"Authorization": f"Bearer {secret}"}
+    image = (folder / "images" / "scene.tif").read_bytes()
+    sent = httpx.post(
+        f"{address}/scenes?name=scene.tif&sigma_m=30", headers=headers, content=image, timeout=60.0
+    )
+    text = (folder / "registered" / "control_points.geojson").read_text(encoding="utf-8")
+    points = [one for one in json.loads(text)["features"] if one["properties"]["status"] == "active"]
+    page.evaluate(f"sessionStorage.setItem('amers-token', {json.dumps(secret)})")
+    page.goto(f"{address}/map#/mark/{sent.raise_for_status().json()['id']}")
+    page.reload()
+    points = points[:: len(points) // (MARKS + 1)]
+    for number, point in enumerate(points[:MARKS]):
+        found = point["properties"]
+        wrong_px = WRONG_PX if number == MARKS - 1 else 0.0
+        page.get_by_label("Place in the image").fill(f"{found['line']}, {found['sample'] + wrong_px}")
+        page.get_by_label("Place on the ground").fill(
+            ", ".join(map(str, point["geometry"]["coordinates"]))
+        )
+        page.get_by_role("button", name="Set").click()
+        page.get_by_role("button", name=f"Show M{number + 1}").wait_for()
+    lon, lat = points[MARKS]["geometry"]["coordinates"][:2]
+    page.get_by_label("Go to").fill(f"{lat}, {lon}")
+    page.get_by_label("Go to").press("Enter")
+    page.wait_for_timeout(DRAWING_MS)
+    page.locator("#map canvas").click()
+    page.wait_for_timeout(DRAWING_MS)
 
 
 def keep(page: Page, name: str) -> None:
@@ -52,8 +89,8 @@ def keep(page: Page, name: str) -> None:
 
 
 @contextmanager
-def service_of(block: Path) -> Iterator[str]:
-    """The address of a service with public points whose store has one block, for the `with`."""
+def service_of(block: Path) -> Iterator[tuple[str, str]]:
+    """Address and token of a service with public points and one block, for the `with`."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -63,11 +100,13 @@ def service_of(block: Path) -> Iterator[str]:
         Path(data).chmod(0o711)
         environment = {**os.environ, "AMERS_DATA_FOLDER": data, "AMERS_PUBLIC_POINTS": "true"}
         subprocess.run([*amers, "block", "ingest", str(block), "--publish"], env=environment, check=True)
+        create = [*amers, "token", "create", "pictures", "--scope", "register", "--json"]
+        token = json.loads(subprocess.check_output(create, env=environment))
         service = subprocess.Popen([*amers, "serve", "--port", str(port)], env=environment)
         try:
             address = f"http://127.0.0.1:{port}"
             wait_for(address)
-            yield address
+            yield address, token["secret"]
         finally:
             service.terminate()
             service.wait()

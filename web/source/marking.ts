@@ -83,6 +83,8 @@ class Marking {
   private next: PlaceOfMarks | null = null;
   private request = new AbortController();
   private outline: Position[] = [];
+  /** Whether it is known where heights come from: until then nothing is chosen. */
+  private isOpen = false;
 
   private readonly heading = h("h2");
   private readonly prompt = h("p", { class: "prompt", role: "status" });
@@ -133,11 +135,6 @@ class Marking {
   async open(instead: HTMLElement): Promise<void> {
     const { panel, atlas, signal } = this.place;
     const { lines, samples } = this.model;
-    const tools = h("div", { class: "tools", role: "group", "aria-label": "Marks" }, this.undo, this.redo, this.save, this.send);
-    instead.replaceWith(h("div", { class: "marking-panel" }, h("div", {}, this.form(), this.chip.element, this.mistake), h("div", {}, h("div", { class: "marking-head" }, tools, this.summary), this.table.element, this.onward, this.notes, this.stated.element, this.fileField())));
-    panel.ownerDocument.addEventListener("keydown", (event) => this.shortcut(event), { signal });
-    atlas.pick((position, point) => void this.chooseOnMap(position, point), signal);
-    atlas.aim(OF_MAP, signal);
     const corners = [[0, 0], [0, samples - 1], [lines - 1, samples - 1], [lines - 1, 0]].map(([line, sample]) => ({ line, sample }));
     const { places } = await this.ask([], corners);
     this.outline = places.filter(({ lon }) => lon != null).map(({ lon, lat }) => [lon!, lat!]);
@@ -148,7 +145,13 @@ class Marking {
     await atlas.show("scenes", [{ type: "Feature", geometry, properties: { id: this.scene.id, name: this.scene.name } }]);
     atlas.fit(geometry);
     const reference = await referenceChoice(atlas, this.outline, signal);
+    const tools = h("div", { class: "tools", role: "group", "aria-label": "Marks" }, this.undo, this.redo, this.save, this.send);
+    instead.replaceWith(h("div", { class: "marking-panel" }, h("div", {}, this.form(), this.chip.element, this.mistake), h("div", {}, h("div", { class: "marking-head" }, tools, this.summary), this.table.element, this.onward, this.notes, this.stated.element, this.fileField())));
+    panel.ownerDocument.addEventListener("keydown", (event) => this.shortcut(event), { signal });
+    atlas.pick((position, point) => void this.chooseOnMap(position, point), signal);
+    atlas.aim(OF_MAP, signal);
     if (reference) this.chip.element.after(reference);
+    this.isOpen = true;
     this.refresh();
     await this.adjust();
   }
@@ -217,6 +220,7 @@ class Marking {
 
   /** Take a half of a mark, or both; a mark with both and a height is complete. */
   private choose(half: { image?: InImage; ground?: OnGround }): void {
+    if (!this.isOpen) return;
     const begun: Begun = { ...this.begun, ...half };
     const { image, ground } = begun;
     const marks = this.completed(begun);
