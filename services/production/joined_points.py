@@ -145,6 +145,10 @@ def _concatenated(parts: Sequence[ControlPoints], images: tuple[Acquisition, ...
         azimuth_deg=of_views("azimuth_deg"),
         health=of_views("health"),
     )
+    used, number = np.unique(views.image, return_inverse=True)
+    views = replace(
+        views, image=number.astype(np.int64), images=tuple(images[row] for row in used.tolist())
+    )
     return ControlPoints(
         id=np.arange(n, dtype=np.int64),
         lon_lat_h=column("lon_lat_h"),

@@ -8,7 +8,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from amers.services.errors import InputError, NotEnoughPoints
+from amers.services.errors import AmersError, InputError, NotEnoughPoints
 from amers.services.geodesy import box_around
 from amers.services.imagery.gaps import bridged, filled
 from amers.services.imagery.scene import Scene, scene_centre, scene_gsd_m
@@ -16,7 +16,7 @@ from amers.services.imagery.source import Window, block_means
 from amers.services.matching.multi_image import chip_inside
 from amers.services.production.detail_points import detail_points, detail_saliency
 from amers.services.production.point_views import check_image_names, chips_of
-from amers.services.production.view_agreement import AgreedViews, agreed_views
+from amers.services.production.view_agreement import AgreedViews, agreed_views, refuse
 from amers.services.statements import Statements
 from amers.services.terrain import Terrain
 from amers.services.types import (
@@ -136,7 +136,9 @@ def produce_ortho_points(
     heights: GroundHeights,
     options: OrthoPointOptions = OrthoPointOptions(),
     progress: Progress = no_progress,
+    *,
     wanted: Callable[[Array], BoolArray] = everywhere,
+    not_found: Callable[[AmersError], None] = refuse,
 ) -> OrthoPoints:
     """Control points with chips, produced from ortho-images of one place and the heights of its ground.
 
@@ -155,6 +157,7 @@ def produce_ortho_points(
         options: thresholds.
         progress: receives the fraction done.
         wanted: whether the squares with centres (n, 2), longitude and latitude, need a point.
+        not_found: receives the error of an image in which the points are not found, see `agreed_views`.
 
     Raises:
         InputError: a scene has a parallax, so that it is no ortho-image, or two have one name.
@@ -172,8 +175,8 @@ def produce_ortho_points(
     search = part_of(progress, 0.0, 0.9 if len(scenes) == 1 else 0.5)
     corners = _corners(scenes, heights, squares, gsds_m[0], options, progress=search)
     lon_lat_h = np.array([corner.lon_lat_h for corner in corners]).reshape(-1, 3)
-    agreed = agreed_views(scenes, lon_lat_h, gsds_m[0], progress=part_of(progress, 0.5, 0.4))
-    _check_one_place(scenes, agreed)
+    agreed = agreed_views(scenes, lon_lat_h, gsds_m[0], part_of(progress, 0.5, 0.4), not_found=not_found)
+    _check_one_place(scenes, agreed, not_found)
     rows = _best_of_squares(corners, agreed, options)
     if len(rows) < _MIN_POINTS:
         found = f", found in {options.min_views} images" if len(scenes) > 1 else ""
@@ -281,14 +284,18 @@ def _best_of_squares(
     return np.asarray(confirmed[np.unique(squares, return_index=True)[1]])
 
 
-def _check_one_place(scenes: Sequence[Scene], agreed: AgreedViews) -> None:
-    """Refuse an image that shows too few of the corners."""
+def _check_one_place(
+    scenes: Sequence[Scene], agreed: AgreedViews, not_found: Callable[[AmersError], None]
+) -> None:
+    """Report an image that shows too few of the corners."""
     for other, tied in zip(scenes, agreed.tied, strict=True):
         if not tied:
-            raise InputError(
-                f"{other.acquisition.image_id}: shows fewer than 6 salient corners of "
-                f"{scenes[0].acquisition.image_id}; expected images of one place: make a block of each"
+            first = scenes[0].acquisition.image_id
+            message = (
+                f"{other.acquisition.image_id}: shows fewer than 6 salient corners of {first}; expected "
+                "images of one place: make a block of each"
             )
+            not_found(InputError(message))
 
 
 def _check_scenes(scenes: Sequence[Scene]) -> None:

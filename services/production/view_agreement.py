@@ -1,13 +1,13 @@
 """Several images of the same ground: brought onto one of them, with the views of points that agree."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from amers.services.conventions import CHIP_SIZE
-from amers.services.errors import NotEnoughPoints
+from amers.services.errors import AmersError, NotEnoughPoints
 from amers.services.geodesy import move_metres
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import render_chip
@@ -87,11 +87,17 @@ class AgreedViews:
         return max(1.0, float(ratio[1:].max(initial=0.0)))
 
 
+def refuse(error: AmersError) -> None:
+    """Raise an error."""
+    raise error
+
+
 def agreed_views(
     scenes: Sequence[Scene],
     lon_lat_h: Array,
     gsd_m: float,
     progress: Progress = no_progress,
+    not_found: Callable[[AmersError], None] = refuse,
 ) -> AgreedViews:
     """The views of points in several images, of which the first that shows a point defines its detail.
 
@@ -105,6 +111,8 @@ def agreed_views(
         lon_lat_h: (n, 3) the points.
         gsd_m: ground sampling of the chips, metres.
         progress: receives the fraction done.
+        not_found: receives the error of an image in which points are not found: by default it is raised;
+            otherwise the image gives no views.
 
     Raises:
         NotEnoughPoints: an image shows the points of earlier ones, but they are not found in it.
@@ -120,7 +128,11 @@ def agreed_views(
         rows = np.flatnonzero(whole[k] & (reference < k))
         if len(rows) < _MIN_COMMON:
             continue
-        shift_m[k], agreeing, sigma_m = search.agreement(scenes[k], rows, gsd_m)
+        try:
+            shift_m[k], agreeing, sigma_m = search.agreement(scenes[k], rows, gsd_m)
+        except NotEnoughPoints as error:
+            not_found(error)
+            continue
         tied[k] = True
         search.placed[k] = _moved(scenes[k], lon_lat_h[rows], shift_m[k])
         pairs += [(int(row), k) for row in agreeing]

@@ -13,7 +13,7 @@ from amers.app.errors import InputError
 from amers.app.usecases.base.request import BaseOptions, area_km2
 from amers.app.usecases.base.search import COARSE_FACTOR, spacing_m, widened
 from amers.app.usecases.base.windows import WindowReader
-from amers.services.errors import NotEnoughPoints
+from amers.services.errors import AmersError, NotEnoughPoints
 from amers.services.formats.images.scenes import read_scene
 from amers.services.geodesy import metres_per_degree
 from amers.services.imagery.archives import ArchiveImage
@@ -132,7 +132,7 @@ def placed_dates(
     left_out: list[str] = []
     for number, tile in enumerate(tiles):
         part = part_of(progress, number / len(tiles), 1.0 / len(tiles))
-        shift_m = shifts_of_scenes(tile.scenes, heights, few, part)
+        tile, shift_m = _tied(tile, heights, few, part)
         found = np.isfinite(shift_m[:, 0])
         for image, is_found in zip(tile.images, found.tolist(), strict=True):
             if not is_found:
@@ -150,6 +150,24 @@ def placed_dates(
     images = [of_date[date] for date in dates]
     frames = date_frames([one.accuracy for one in images], [one.orbit for one in images], shifts)
     return PlacedDates(used, dates, frames, left_out)
+
+
+def _tied(
+    tile: BaseTile, heights: GroundHeights, options: OrthoPointOptions, progress: Progress
+) -> tuple[BaseTile, Array]:
+    """A tile with the first image in which most others are found, and their shifts (n, 2) against it."""
+    best: tuple[BaseTile, Array] | None = None
+    count = 0
+    for row in range(min(_MOST_FIRST, len(tile.scenes))):
+        turned = tile.take([row, *(i for i in range(len(tile.scenes)) if i != row)])
+        shift_m = shifts_of_scenes(turned.scenes, heights, options, progress)
+        found = int(np.isfinite(shift_m[:, 0]).sum())
+        if best is None or found > count:
+            best, count = (turned, shift_m), found
+        if 2 * count > len(tile.scenes):
+            break
+    assert best is not None, "a tile has an image"
+    return best
 
 
 def points_of_tiles(
@@ -201,6 +219,10 @@ def _point_options(options: BaseOptions, gsd_m: float, step_m: float) -> OrthoPo
     )
 
 
+def _without_views(error: AmersError) -> None:
+    """Go on without an image that shows too little of the squares that are searched."""
+
+
 def _productions(
     tile: BaseTile, heights: GroundHeights, options: OrthoPointOptions, step_m: float, progress: Progress
 ) -> list[tuple[int, OrthoPoints]]:
@@ -223,7 +245,9 @@ def _productions(
         scenes = [tile.scenes[row], *(s for i, s in enumerate(tile.scenes) if i != row)]
         part = part_of(progress, row / _MOST_FIRST, 1.0 / _MOST_FIRST)
         try:
-            production = produce_ortho_points(scenes, heights, options, part, wanted)
+            production = produce_ortho_points(
+                scenes, heights, options, part, wanted=wanted, not_found=_without_views
+            )
         except NotEnoughPoints:
             continue
         made.append((row, production))

@@ -5,18 +5,22 @@ from functools import cache
 
 import numpy as np
 import pytest
+import shapely
 from scipy.ndimage import map_coordinates
 
 from amers.services.errors import InputError, NotEnoughPoints
+from amers.services.geodesy import east_north_up, ecef_from_lon_lat_h
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage
+from amers.services.production.joined_points import TilePoints, joined_points, still_found
 from amers.services.production.ortho_production import (
     OrthoPointOptions,
     OrthoPoints,
     produce_ortho_points,
+    shifts_of_scenes,
 )
 from amers.services.registration.on_points import register_scene
-from amers.services.types import Array
+from amers.services.types import Array, Frame
 from tests.services.production.test_ortho_production import FLAT, GSD_M, SIDE, chips_of, land, ortho
 from tests.services.textures import as_pixels, texture
 
@@ -145,3 +149,68 @@ def test_an_image_of_other_ground_is_refused_by_name() -> None:
 def test_two_images_of_one_name_are_refused() -> None:
     with pytest.raises(InputError, match="must have different names, found date-0, date-0"):
         produce_ortho_points([date(0), date(0)], FLAT, OPTIONS)
+
+
+def other_land() -> Scene:
+    rng = np.random.default_rng(9)
+    return named(ortho(np.zeros((SIDE, SIDE))), as_pixels(texture(rng, SIDE, 3.0)), "elsewhere")
+
+
+def test_an_image_in_which_nothing_is_found_stops_the_work_or_gives_no_views() -> None:
+    scenes = [date(0), other_land(), date(1)]
+    with pytest.raises((NotEnoughPoints, InputError), match="elsewhere"):
+        produce_ortho_points(scenes, FLAT, OPTIONS)
+    met: list[Exception] = []
+    found = produce_ortho_points(scenes, FLAT, OPTIONS, not_found=met.append)
+    assert met
+    assert all("elsewhere" in str(error) for error in met)
+    assert set(found.points.views.image.tolist()) == {0, 2}
+    np.testing.assert_array_equal(found.shift_m[2], made().shift_m[1])
+    shift_m = shifts_of_scenes(scenes, FLAT, OPTIONS)
+    np.testing.assert_array_equal(np.isfinite(shift_m[:, 0]), [True, False, True])
+    np.testing.assert_allclose(shift_m[2], made().shift_m[1], atol=a_tenth_of_a_pixel * GSD_M)
+
+
+def test_only_squares_that_need_a_point_are_searched() -> None:
+    everywhere = made().points.lon_lat_h
+    middle = np.median(everywhere[:, 0])
+    west = produce_ortho_points(
+        [date(0), date(1)], FLAT, OPTIONS, wanted=lambda lon_lat: lon_lat[:, 0] < middle
+    )
+    assert 0.4 < len(west.points) / len(everywhere) < 0.6
+    step_deg = np.ptp(everywhere[:, 0]) / 10.0
+    assert west.points.lon_lat_h[:, 0].max() < middle + step_deg
+
+
+def test_points_of_two_productions_are_joined_far_from_each_other_in_one_frame() -> None:
+    first, second = made(), made(2, 1)
+    whole = shapely.box(*np.concatenate([first.outline.min(axis=0), first.outline.max(axis=0)]))
+    rows = [np.arange(len(one.points)) for one in (first, second)]
+    move_m = np.array([30.0, -20.0])
+    tiles = [
+        TilePoints(first, rows[0], whole.buffer(0.01), move_m),
+        TilePoints(second, rows[1], whole.buffer(0.01), move_m),
+    ]
+    frame = Frame.from_sigmas(4.0, 2.0)
+    points, chips = joined_points(tiles, FLAT, frame, 20.0 * GSD_M)
+    assert points.frames == (frame,)
+    n = len(first.points)
+    assert len(points) > n
+    moved_m = east_north_up(points.lon_lat_h[:1], first.points.lon_lat_h[0])[0, :2]
+    np.testing.assert_allclose(moved_m, move_m, atol=0.1)
+    ecef = ecef_from_lon_lat_h(points.lon_lat_h)
+    apart_m = np.linalg.norm(ecef[n:, None] - ecef[None, :n], axis=2).min(axis=1)
+    assert apart_m.min() >= 20.0 * GSD_M
+    names = [image.image_id for image in points.views.images]
+    assert len(set(names)) == len(names) == 3, "the date that both have is one image"
+    np.testing.assert_array_equal(chips(0), first.chips(0))
+    views = points.views
+    assert len(chips(len(points) - 1)) == views.start[-1] - views.start[-2]
+
+
+def test_a_point_that_two_latest_images_contradict_has_vanished() -> None:
+    found = made()
+    latest = [other_land(), replace(other_land(), acquisition=replace(date(5).acquisition))]
+    assert len(still_found(found, latest[:1])) == len(found.points), "one may be a cloud's shadow"
+    assert len(still_found(found, latest)) == 0
+    assert len(still_found(found, [*latest, date(1)])) == len(found.points), "one of them shows it"
