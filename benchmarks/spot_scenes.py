@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+import cv2
 import numpy as np
 import rasterio
 from rasterio.transform import from_origin
@@ -24,13 +25,16 @@ from typer.testing import CliRunner
 
 from amers.app.cli.main import app
 from amers.app.usecases.registered_scene import registered_scene
+from amers.app.usecases.terrain_file import TerrainFile, read_terrain
 from amers.services.formats.block.document import BlockMetadata, BlockSpecification, Provenance
 from amers.services.formats.block.writer import write_block
-from amers.services.formats.images.raster import write_raster
+from amers.services.formats.images.raster import map_grid_of, open_raster, write_raster
+from amers.services.formats.images.scenes import read_scene
 from amers.services.formats.sensor_models.rigorous_model import read_rigorous_model
 from amers.services.formats.sensor_models.rpc_files import ImageFiles
-from amers.services.geodesy import move_metres
-from amers.services.imagery.source import Window
+from amers.services.geodesy import metres_per_degree_at, move_metres
+from amers.services.imagery.source import ArrayImage, Window
+from amers.services.orthorectification.rectify import orthorectify
 from amers.services.quality.accuracy import accuracy
 from amers.services.quality.correction_accuracy import in_rings
 from amers.services.sensors.base import SensorModel
@@ -62,8 +66,12 @@ ERRORS = {
 }
 """Standard deviations of the errors of the metadata, radians, metres and shares: about half of what the
 published sets of parameters allow, 150 m on the ground; drifts also where a set has none."""
+SQUARE = 96
+"""Side of the squares of ortho-images that are compared, pixels."""
 POINT_SIGMA_M = (1.5, 2.0)
 """Of the points, horizontal and up."""
+_ROOF_M = 2.0
+"""Height above the terrain from which on a place is a roof, or beside one."""
 WAYS = (
     ("points", "RPC"),
     ("points", "srp"),
@@ -72,6 +80,8 @@ WAYS = (
     ("reference", "RPC"),
 )
 """Control, and the model: an RPC, or a rigorous one with the set of its free parameters."""
+USED = ("points", "RPC")
+"""The registration with which vectors are corrected and an ortho-image is made."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +105,8 @@ class Row:
         ce90_m: true CE90, over the area for which accuracy is stated.
         stated_m: CE90 stated over that area (median), relative to the control points.
         worst_m: CE90 stated for its worst place.
+        vectors: true over stated CE90 of vertices drawn on the scene, median of those with an accuracy.
+        ortho_m: CE90 of an ortho-image against one through the true model, by their pixels.
     """
 
     case: Case
@@ -104,6 +116,8 @@ class Row:
     ce90_m: float
     stated_m: float
     worst_m: float
+    vectors: float = float("nan")
+    ortho_m: float = float("nan")
 
     @property
     def ratio(self) -> float:
@@ -113,10 +127,11 @@ class Row:
 
 @dataclass(frozen=True)
 class _Truth:
-    """Pixels (n, 2) of the delivered image and the ground (n, 3) that they show."""
+    """Pixels (n, 2) of the delivered image and their ground (n, 3); the true model of its part."""
 
     line_sample: Array
     ground: Array
+    model: PushbroomModel | None = None
 
 
 def main() -> None:
@@ -135,11 +150,16 @@ def main() -> None:
             "points": ["--block", _write_points(folder / "block", block)],
             "reference": _write_reference(folder, place),
         }
+        control["dem"] = control["reference"][2:6]
         for number in range(arguments.scenes):
             image, truth = _write_product(folder / f"scene_{number}", metadata, delivered, place, number)
             for name, way in WAYS:
                 told = _register(image, control[name], way, folder / "out")
-                rows.append(_judged(image, truth, Case(number, name, way), told))
+                row = _judged(image, truth, Case(number, name, way), told)
+                if (name, way) == USED:
+                    made = image, truth, told, control["dem"]
+                    row = replace(row, vectors=_vectors(*made), ortho_m=_ortho_m(*made))
+                rows.append(row)
                 print(rows[-1], f"{rows[-1].ratio:.2f}", flush=True)
     keep("spot_scenes", [asdict(row) | {"ratio": row.ratio} for row in rows])
     columns: dict[str, Callable[[Row], object]] = {
@@ -153,6 +173,8 @@ def main() -> None:
         "stated": lambda row: f"{row.stated_m:.2f}",
         "worst place": lambda row: f"{row.worst_m:.2f}",
         "true / stated": lambda row: f"{row.ratio:.2f}",
+        "vectors": lambda row: f"{row.vectors:.2f}",
+        "ortho": lambda row: f"{row.ortho_m:.2f}",
     }
     print_table("SPOT 2, CE90 in metres", rows, columns)
 
@@ -220,18 +242,18 @@ def _write_reference(folder: Path, place: Place) -> list[object]:
     geometry = plan_geometry(world, plan, np.random.default_rng(3))
     pixels = TiledView(world, geometry, 17).read(Window(0, 0, *plan.shape))
     write_raster(folder / "reference.tif", pixels.astype(np.uint16), geometry.rpc)
-    half = 0.2
+    half, nodes = 0.26, 1821
     lon, lat = place.centre_lon_lat
-    axes = np.linspace(-half, half, 1401)
+    axes = np.linspace(-half, half, nodes)
     lon_lat = np.stack(np.meshgrid(lon + axes, lat - axes), axis=-1).reshape(-1, 2)
-    heights = world.height_m(lon_lat).reshape(1401, 1401).astype(np.float32)
+    heights = world.height_m(lon_lat).reshape(nodes, nodes).astype(np.float32)
     step = axes[1] - axes[0]
-    size = {"height": 1401, "width": 1401, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
+    size = {"height": nodes, "width": nodes, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
     corner = from_origin(lon - half - step / 2.0, lat + half + step / 2.0, step, step)
     with rasterio.open(folder / "dem.tif", "w", driver="GTiff", transform=corner, **size) as file:
         file.write(heights, 1)
     dem = ["--dem", folder / "dem.tif", "--vertical", "ellipsoid"]
-    _run("ortho", folder / "reference.tif", *dem, "-o", folder / "ortho.tif")
+    _run("scene", "ortho", folder / "reference.tif", *dem, "-o", folder / "ortho.tif")
     return ["--reference", folder / "ortho.tif", *dem, "--reference-sigma-m", "1.0"]
 
 
@@ -264,16 +286,16 @@ def _write_product(
     shutil.copyfile(metadata, folder / "METADATA.DIM")
     axes = np.linspace(0.0, PART - 1.0, 40)
     places = np.stack(np.meshgrid(axes, axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    return image, _Truth(places + first, surface_seen(world, true_model, places))
+    return image, _Truth(places + first, surface_seen(world, true_model, places), true_model)
 
 
 def _register(image: Path, control: list[object], way: str, folder: Path) -> Path:
     """The folder of a registration by the command line."""
     shutil.rmtree(folder, ignore_errors=True)
     if way == "RPC":
-        _run("register", image, *control, "-o", folder, refused=True)
+        _run("scene", "register", image, *control, "-o", folder, refused=True)
         return folder
-    _run("register-many", image, *control, "--rigorous", way, "-o", folder, refused=True)
+    _run("scene", "register-many", image, *control, "--rigorous", way, "-o", folder, refused=True)
     return next(folder.glob("*/correction.json"), folder / "correction.json").parent
 
 
@@ -297,6 +319,60 @@ def _judged(image: Path, truth: _Truth, case: Case, folder: Path) -> Row:
     )
 
 
+def _vectors(image: Path, truth: _Truth, registered: Path, dem: list[object]) -> float:
+    """True over stated CE90 of points drawn on the scene, of those on the terrain that points hold."""
+    places = [{"type": "Point", "coordinates": place[::-1]} for place in truth.line_sample.tolist()]
+    features = [{"type": "Feature", "properties": {}, "geometry": place} for place in places]
+    drawn, output = registered / "drawn.geojson", registered / "map.geojson"
+    drawn.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    of_scene = [
+        "--scene",
+        image,
+        "--registration",
+        registered,
+        "--pixels",
+        "centre",
+        "--sigma-px",
+        "0.01",
+    ]
+    _run("vectors", "correct", drawn, *of_scene, *dem, "--to", "EPSG:4326", "-o", output)
+    found = json.loads(output.read_text())["features"]
+    stated_m = np.array([one["properties"]["ce90_m"] or np.nan for one in found], dtype=np.float64)
+    ground = np.array([one["geometry"]["coordinates"] for one in found])
+    off_m = np.hypot(*((ground - truth.ground)[:, :2] * metres_per_degree_at(truth.ground)).T)
+    # Roofs are not in the terrain.
+    known = np.isfinite(stated_m) & (np.abs(ground[:, 2] - truth.ground[:, 2]) < _ROOF_M)
+    return float(np.quantile(off_m[known], 0.9) / np.median(stated_m[known]))
+
+
+def _ortho_m(image: Path, truth: _Truth, registered: Path, dem: list[object]) -> float:
+    """CE90 of an ortho-image by the displacements of its squares against one through the true model."""
+    output = registered / "ortho.tif"
+    _run("scene", "ortho", image, "--registered", registered, *dem, "--gsd-m", GSD_M, "-o", output)
+    made = open_raster(output)
+    grid = map_grid_of(made)
+    pixels = made.read(Window(0, 0, *made.shape))
+    assert grid is not None
+    assert truth.model is not None
+    scene = read_scene(image, sigma_m=1.0)
+    first = truth.line_sample.min(axis=0).astype(int)
+    part = ArrayImage(scene.image.read(Window(int(first[0]), int(first[1]), PART, PART)))
+    ground = read_terrain(TerrainFile(Path(str(dem[1])), "ellipsoid"))
+    true = np.full(made.shape, np.nan, dtype=np.float32)
+    for one in orthorectify([part], truth.model, ground, grid):
+        w = one.window
+        true[w.line : w.line + w.lines, w.sample : w.sample + w.samples] = one.pixels[0]
+    off = []
+    for line in range(0, made.shape[0] - SQUARE, SQUARE):
+        for sample in range(0, made.shape[1] - SQUARE, SQUARE):
+            squares = [full[line : line + SQUARE, sample : sample + SQUARE] for full in (pixels, true)]
+            if all(np.isfinite(square).all() for square in squares):
+                window = cv2.createHanningWindow((SQUARE, SQUARE), cv2.CV_32F)
+                shift, _ = cv2.phaseCorrelate(*squares, window)
+                off.append(np.hypot(*shift) * GSD_M)
+    return float(np.quantile(off, 0.9))
+
+
 def _ce90_m(model: SensorModel, truth: _Truth) -> float:
     """True CE90 of a model, metres on the ground."""
     error_px = model.project(truth.ground) - truth.line_sample
@@ -304,13 +380,13 @@ def _ce90_m(model: SensorModel, truth: _Truth) -> float:
     return accuracy(np.linalg.solve(derivative, error_px[:, :, None])[:, :, 0]).ce90_m.value
 
 
-def _run(command: str, *words: object, refused: bool = False) -> None:
-    """Run a command of scenes; its failure is told, or ends the benchmark."""
-    result = CliRunner().invoke(app, ["scene", command, *(str(word) for word in words)])
+def _run(*words: object, refused: bool = False) -> None:
+    """Run a command; its failure is told, or ends the benchmark."""
+    result = CliRunner().invoke(app, [str(word) for word in words])
     if result.exit_code and not refused:
-        raise SystemExit(f"scene {command}: {result.output}{result.exception}")
+        raise SystemExit(f"{words}: {result.output}{result.exception}")
     if result.exit_code:
-        print(f"scene {command}: {result.exception or result.output}", flush=True)
+        print(f"{words[:2]}: {result.exception or result.output}", flush=True)
 
 
 if __name__ == "__main__":
