@@ -74,6 +74,8 @@ function share(cells: Record<string, number>): string {
 /** The fields of one or two places, which clicks on the map fill too, and what the surface has there. */
 class Heights {
   private readonly outcome = h("div", { role: "status" });
+  /** Of the last question: an answer that another question has overtaken is not shown. */
+  private asked = 0;
   private readonly from = this.field("from", "Place, or start of a profile");
   private readonly to = this.field("to", "End of the profile");
   readonly element = h(
@@ -116,10 +118,12 @@ class Heights {
 
   private async show(): Promise<void> {
     const { atlas, signal } = this.place;
+    const own = ++this.asked;
     try {
       const places = [this.from, this.to].map(({ value }) => value.trim()).filter(Boolean).map(read);
       if (!places.length) throw new Error("Write latitude, then longitude, in degrees, as in 43.25, 5.25, or click the map.");
       const { heights } = await get<SurfaceHeights>(`jobs/${this.job}/map/surface/heights?along=${places.flat().join(",")}`, signal);
+      if (own !== this.asked) return;
       const status = { status: "active" };
       await atlas.show("vectors", [
         { type: "Feature", properties: status, geometry: { type: "MultiPoint", coordinates: places } },
@@ -128,7 +132,7 @@ class Heights {
       fill(this.outcome, places.length > 1 ? profileChart(heights) : h("p", {}, heightWords(heights[0]!)));
       announce(places.length > 1 ? "The profile is shown." : "The height is shown.");
     } catch (error) {
-      if (!signal.aborted) fill(this.outcome, problem(error));
+      if (!signal.aborted && own === this.asked) fill(this.outcome, problem(error));
     }
   }
 }
