@@ -45,7 +45,9 @@ OWN_FILES = frozenset(
         "parse_correction",
         "parse_correction_accuracy",
         "parse_frame",
+        "parse_scene_model",
         "read_adjusted_images",
+        "read_archive",
         "read_block",
         "read_chip_file",
         "read_document",
@@ -57,12 +59,14 @@ OWN_FILES = frozenset(
         "read_views",
     }
 )
-"""Functions that read files of a defined format which Amers writes, and checks as a whole."""
+"""Functions that read files of a format which Amers defines, and checks as a whole."""
 PARTS = frozenset(
     {
         "load_json",
         "open_dataset",
         "open_image",
+        "open_mosaic",
+        "open_piece",
         "open_tiles",
         "read_model_file",
         "open_heights",

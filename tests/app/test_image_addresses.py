@@ -201,6 +201,7 @@ def test_only_the_operator_s_production_makes_addresses() -> None:
 
     The map of a surface reads a result out of the bucket of the storage, by a key of its own making.
     References and terrains in pieces are those of commands; references of a store are no catalogues.
+    Bases are made from catalogues that the operator's settings name.
     """
     root = Path(__file__).parents[2]
     makers = {
@@ -211,6 +212,7 @@ def test_only_the_operator_s_production_makes_addresses() -> None:
     }
     assert makers == {
         "app/cli/image_production.py",
+        "app/usecases/base/windows.py",
         "app/usecases/image_production.py",
         "app/usecases/surface_map.py",
         "services/formats/addresses.py",
