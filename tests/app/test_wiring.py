@@ -1,0 +1,34 @@
+"""Every option of a command goes where it went: to the same argument, as the same value.
+
+`tests/golden/wiring.json` has where: one line for each option. After a change that is meant, write it
+anew (`python -m tests.app.wiring`) and read what differs.
+"""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.app.wiring import GOLDEN, commands_to_run, wiring
+
+pytestmark = pytest.mark.thorough
+
+EXPECTED = json.loads(GOLDEN.read_text())
+NOWHERE = 48
+"""Options, of 481, whose way is not seen so: they need others in a way of their own, or what they are
+given to is a result, for which nothing stands in. The number may not grow."""
+
+
+@pytest.mark.parametrize("words", list(commands_to_run()), ids=" ".join)
+def test_options_arrive_where_they_did(words: tuple[str, ...], tmp_path: Path) -> None:
+    assert wiring(words, tmp_path) == EXPECTED[" ".join(words)]
+
+
+def test_nearly_all_options_are_seen_to_arrive() -> None:
+    nowhere = [
+        f"{command} {option}"
+        for command, options in EXPECTED.items()
+        for option, places in options.items()
+        if not [place for place in places if not place.startswith("exit status")] and option != "--json"
+    ]
+    assert len(nowhere) <= NOWHERE, nowhere

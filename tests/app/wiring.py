@@ -1,0 +1,307 @@
+"""What a command hands on: each of its options alone, with what it calls replaced by recorders.
+
+Every function of the use cases, the database and the sciences that a module of the command line has is
+replaced by one that notes its arguments. A command is run without an option and with it; what differs in
+the notes is where the option goes, and as what.
+"""
+
+import contextlib
+import dataclasses
+import inspect
+import json
+import re
+import sys
+import typing
+from collections.abc import Iterator, Mapping
+from datetime import datetime
+from enum import Enum
+from pathlib import Path
+from tempfile import TemporaryDirectory, gettempdir
+from types import ModuleType
+from typing import Any
+from unittest.mock import MagicMock
+from uuid import UUID
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from amers.app.cli.commands import COMMANDS
+from amers.app.cli.main import app
+from amers.app.cli.on_demand import Group, Tree, _load
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "wiring.json"
+PACKAGE = "amers.app.cli."
+SERVICES = ("demo", "serve", "worker")
+"""Commands that run services, which no recorder ends."""
+RECORDED = ("amers.app.", "amers.services.")
+AN_ID = "01234567-89ab-4cde-8f01-23456789abcd"
+TEXTS: Mapping[str, str] = {
+    "--bbox": "17.01,43.02,17.03,43.04",
+    "--crs": "EPSG:32617",
+    "--to": "EPSG:32617",
+    "--control-crs": "EPSG:32617",
+    "--crop-origin": "17,19",
+    "--vertical": "EGM96",
+    "--control-vertical": "EGM96",
+    "--kernel": "bilinear",
+    "--scope": "read",
+    "reference": "flat@2",
+    "--control-sigma-m": "17,19",
+    "--control-frame-sigma-m": "17,19",
+    "--site-frame-sigma-m": "17,19",
+    "--point-sigma-m": "17,19",
+    "--columns": "lon=a,lat=b",
+    "--control-columns": "lon=a,lat=b",
+    "--gsd-m": "17,19",
+    "--sigma-axes": "east,north",
+    "--pixels": "corner",
+}
+"""Values of options whose text has a form."""
+BESIDE: Mapping[str, tuple[str, ...]] = {
+    "scene ortho": ("--vertical", "ellipsoid"),
+    "vectors correct": ("--vertical", "ellipsoid"),
+    "vectors project": ("--vertical", "ellipsoid"),
+    "block frame": ("--control", "FILE", "--images", "FILE"),
+    "production run": ("--images", "FILE"),
+    "base make": ("--bbox", "1.0", "2.0", "1.1", "2.1"),
+}
+"""Words that commands need beside what they require, FILE for a file."""
+_DEM = ("--dem", "FILE")
+COMPANIONS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("--control-ortho-", ("--control-ortho", "FILE", "--control-dem", "FILE")),
+    ("--control-dem-", ("--control-dem", "FILE", "--control-dem-vertical", "ellipsoid")),
+    ("--control-", ("--control", "FILE")),
+    ("--reference-", ("--reference", "FILE", *_DEM, "--vertical", "ellipsoid")),
+    ("--reference", (*_DEM, "--vertical", "ellipsoid")),
+    ("--dem-", (*_DEM, "--dem-vertical", "ellipsoid")),
+    ("--vertical", _DEM),
+    ("--geoid", (*_DEM, "--vertical", "EGM2008")),
+    ("--token", ("--server", "http://127.0.0.1:9")),
+)
+"""What an option needs beside it, by how its name begins; the first that fits."""
+_FILES = ("dem", "control_dem", "model")
+"""Options whose files the command itself looks for."""
+_CONVERTED = ("parse_", "printable", "by_", "checked_", "named_", "box_of", "stated_", "file_place")
+"""How functions begin that only convert what is given: these are called."""
+_OBJECT = re.compile(r" at 0x[0-9a-f]+| id='\d+'|" + re.escape(gettempdir()) + r"/[\w.-]+")
+
+
+def commands(tree: Tree = COMMANDS, words: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """The words of every command."""
+    for name, entry in tree.items():
+        if isinstance(entry, Group):
+            yield from commands(entry.commands, (*words, name))
+        else:
+            yield (*words, name)
+
+
+def commands_to_run() -> Iterator[tuple[str, ...]]:
+    """The words of every command but of those that run services."""
+    return (words for words in commands() if words[0] not in SERVICES)
+
+
+def parameters(words: tuple[str, ...]) -> list[Any]:
+    """The arguments and options of a command."""
+    entry: Any = COMMANDS
+    for word in words:
+        entry = entry.commands[word] if isinstance(entry, Group) else entry[word]
+    return [one for one in _load(words[-1], entry).params if one.name != "help"]
+
+
+class Anything(MagicMock):
+    """A result that is printed, compared and passed on like any."""
+
+    def __format__(self, _spec: str) -> str:
+        """Some text."""
+        return "anything"
+
+    def __lt__(self, _other: object) -> bool:
+        """Never."""
+        return False
+
+    __gt__ = __le__ = __ge__ = __lt__
+
+
+class Recorders:
+    """Stands in for all that the command line calls."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Replace the functions in all modules of the command line."""
+        self.notes: list[tuple[str, str]] = []
+        for name, module in list(sys.modules.items()):
+            if name.startswith(PACKAGE):
+                for own, value in list(vars(module).items()):
+                    stand_in = self._in_place_of(value)
+                    if stand_in is not None:
+                        monkeypatch.setattr(module, own, stand_in)
+
+    def _in_place_of(self, value: object) -> object | None:
+        """What stands in for a function, or for a module with functions; None for anything else."""
+        if isinstance(value, ModuleType):
+            return _RecordedModule(self, value) if _is_recorded(value.__name__) else None
+        of = getattr(value, "__module__", "") or ""
+        if inspect.isfunction(inspect.unwrap(value)) and _is_recorded(of):  # type: ignore[arg-type]
+            return None if value.__name__.startswith(_CONVERTED) else self.of(value)
+        return None
+
+    def of(self, function: Any) -> Any:
+        """A recorder in place of a function."""
+        name = function.__qualname__
+
+        def recorder(*arguments: Any, **named: Any) -> Any:
+            for place, value in [*enumerate(arguments), *named.items()]:
+                self.notes.extend(leaves(f"{name}({place})", value))
+            return Anything(name=f"{name}()")
+
+        return recorder
+
+
+class _RecordedModule:
+    """A module whose functions are recorded."""
+
+    def __init__(self, recorders: Recorders, module: ModuleType) -> None:
+        self._recorders, self._module = recorders, module
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._module, name)
+        stand_in = self._recorders._in_place_of(value)
+        return value if stand_in is None else stand_in
+
+
+def _is_recorded(module: str) -> bool:
+    return module.startswith(RECORDED) and not module.startswith((PACKAGE, "amers.app.config"))
+
+
+def leaves(path: str, value: Any, depth: int = 0) -> Iterator[tuple[str, str]]:
+    """The values in a value, each with the path that leads to it."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type) and depth < 6:
+        for field in dataclasses.fields(value):
+            yield from leaves(f"{path}.{field.name}", getattr(value, field.name, None), depth + 1)
+    elif isinstance(value, dict) and depth < 6:
+        for key, one in value.items():
+            yield from leaves(f"{path}[{key}]", one, depth + 1)
+    elif isinstance(value, list | tuple) and depth < 6:
+        for number, one in enumerate(value):
+            yield from leaves(f"{path}[{number}]", one, depth + 1)
+    elif isinstance(value, np.ndarray):
+        yield path, str(value.tolist())
+    elif isinstance(value, str | int | float | Path | UUID | Enum | datetime | type(None)):
+        yield path, str(value)
+
+
+def value_of(parameter: Any, folder: Path) -> list[str]:
+    """Words that give a parameter a value that is not its default."""
+    option = parameter.opts[0]
+    given = [option] if option.startswith("-") else []
+    if getattr(parameter, "is_flag", False):
+        names = parameter.secondary_opts if parameter.default is True else parameter.opts
+        return [names[0]]
+    kind = _kind(parameter.type_descriptor.annotation)
+    if kind is Path:
+        return [*given, str(_file(parameter, folder))]
+    if kind in (int, float):
+        return [*given, _number(parameter, kind)]
+    if kind is UUID:
+        return [*given, AN_ID]
+    if kind is datetime:
+        return [*given, "2017-03-19T11:13:00"]
+    if parameter.nargs > 1:
+        return [*given, *(str(17 + number) for number in range(parameter.nargs))]
+    if parameter.type_descriptor.parameter_info.exists or parameter.name in _FILES:
+        return [*given, str(_file(parameter, folder))]
+    choices = _choices(kind)
+    if choices:
+        return [*given, next(one for one in reversed(choices) if one != str(parameter.default))]
+    return [*given, TEXTS.get(option, f"text-of-{parameter.name}")]
+
+
+def _kind(annotation: Any) -> Any:
+    """The type of one value."""
+    if typing.get_origin(annotation) is typing.Annotated:
+        return _kind(typing.get_args(annotation)[0])
+    inside = [one for one in typing.get_args(annotation) if one not in (type(None), Ellipsis)]
+    if typing.get_origin(annotation) is typing.Literal or not inside:
+        return annotation
+    return _kind(inside[0])
+
+
+def _choices(kind: Any) -> list[str]:
+    if typing.get_origin(kind) is typing.Literal:
+        return [str(one) for one in typing.get_args(kind)]
+    return [str(one.value) for one in kind] if isinstance(kind, type) and issubclass(kind, Enum) else []
+
+
+def _number(parameter: Any, kind: type) -> str:
+    info = parameter.type_descriptor.parameter_info
+    low = info.min if info.min is not None else 0
+    high = info.max if info.max is not None else low + 40
+    value = low + (high - low) * 0.4375
+    return str(round(value)) if kind is int else str(value)
+
+
+def _file(parameter: Any, folder: Path) -> Path:
+    info = parameter.type_descriptor.parameter_info
+    path = folder / parameter.name
+    if info.exists and not info.file_okay:
+        path.mkdir(exist_ok=True)
+    elif info.exists or parameter.name in _FILES:
+        path.write_text("")
+    return path
+
+
+def run(words: list[str], folder: Path) -> list[tuple[str, str]]:
+    """What a command hands on, without the names of temporary folders."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        recorders = Recorders(monkeypatch)
+        with contextlib.suppress(Exception):
+            result = CliRunner().invoke(app, words)
+            recorders.notes.append(("exit status", str(result.exit_code)))
+    plain = [
+        (path, _OBJECT.sub("", text.replace(str(folder), "FOLDER"))) for path, text in recorders.notes
+    ]
+    return plain
+
+
+def wiring(words: tuple[str, ...], folder: Path) -> dict[str, list[str]]:
+    """Where each option of a command goes, and as what."""
+    own = parameters(words)
+    (folder / "beside").write_text("")
+    beside = [str(folder / "beside") if w == "FILE" else w for w in BESIDE.get(" ".join(words), ())]
+    required = [word for one in own if one.required for word in value_of(one, folder)] + beside
+    found = {}
+    base = run([*words, *required], folder)
+    bases: dict[tuple[str, ...], list[tuple[str, str]]] = {(): base}
+    names = {name for one in own for name in one.opts}
+    for one in own:
+        if one.required:
+            value = value_of(one, folder)[-1].replace(str(folder), "FOLDER")
+            found[one.opts[0]] = sorted({f"{path} = {text}" for path, text in base if value in text})
+            continue
+        needs = next((more for start, more in COMPANIONS if one.opts[0].startswith(start)), ())
+        with_it = _without(needs, one.opts[0], names, str(folder / "beside"))
+        if with_it not in bases:
+            bases[with_it] = run([*words, *required, *with_it], folder)
+        notes = run([*words, *required, *with_it, *value_of(one, folder)], folder)
+        moved = set(notes) - set(bases[with_it])
+        found[one.opts[0]] = sorted({f"{path} = {text}" for path, text in moved})
+    return found
+
+
+def _without(needs: tuple[str, ...], option: str, names: set[str], file: str) -> tuple[str, ...]:
+    """What an option needs, without itself and without options that the command does not have."""
+    pairs = zip(needs[::2], needs[1::2], strict=True)
+    return tuple(
+        word
+        for name, value in pairs
+        if name in names and name != option
+        for word in (name, file if value == "FILE" else value)
+    )
+
+
+if __name__ == "__main__":
+    found = {}
+    for words_of_one in commands_to_run():
+        with TemporaryDirectory() as scratch:
+            found[" ".join(words_of_one)] = wiring(words_of_one, Path(scratch))
+    GOLDEN.write_text(json.dumps(found, indent=1) + "\n")
