@@ -84,7 +84,7 @@ _FILES = ("dem", "control_dem", "model")
 """Options whose files the command itself looks for."""
 _CONVERTED = ("parse_", "printable", "by_", "checked_", "named_", "box_of", "stated_", "file_place")
 """How functions begin that only convert what is given: these are called."""
-_OBJECT = re.compile(r" at 0x[0-9a-f]+| id='\d+'|" + re.escape(gettempdir()) + r"/[\w.-]+")
+_OBJECT = re.compile(r" at 0x[0-9a-f]+| id='\d+'|/\d{12,}|" + re.escape(gettempdir()) + r"/[\w.-]+")
 
 
 def commands(tree: Tree = COMMANDS, words: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
