@@ -241,7 +241,7 @@ def run_orthorectification(
     dtype, nodata = pixel_type(raster)
     if limits is not None:
         limits.check([scene], grid, len(bands) * np.dtype(dtype).itemsize)
-    counter = _DataPixels(partial(unseen, scene, ground))
+    counter = DataPixels(partial(unseen, scene, ground))
     windows = counter.count(orthorectify(bands, scene.model, ground, grid, options, progress=progress))
     saturated = next(reversed(raster.saturated_values(1)), None)
     error_px = write_cog(output, grid, windows, BandForm(len(bands), dtype, nodata, saturated))
@@ -283,13 +283,19 @@ def pixel_type(raster: SceneImage) -> tuple[str, float]:
 
 
 @dataclass
-class _DataPixels:
-    """Counts the pixels with data of windows on their way into the file: none at all is an error."""
+class DataPixels:
+    """Counts the pixels with data of windows on their way into the file: none at all is an error.
+
+    Attributes:
+        of_none: makes that error.
+        pixels: with data so far, of all bands.
+    """
 
     of_none: Callable[[], CoverageError]
     pixels: int = 0
 
     def count(self, windows: Iterator[OrthoWindow]) -> Iterator[OrthoWindow]:
+        """The windows, counted."""
         for window in windows:
             self.pixels += int((~np.isnan(window.pixels)).sum())
             yield window

@@ -1,8 +1,8 @@
 """Straighten a scene whose lines or samples moved: for the command line, and as a process."""
 
-from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -15,19 +15,19 @@ from amers.app.db.engine import Connection
 from amers.app.db.tokens import Token
 from amers.app.errors import InputError
 from amers.app.usecases.damage import suspecting_damage
-from amers.app.usecases.orthorectification import pixel_type
+from amers.app.usecases.orthorectification import DataPixels, pixel_type
 from amers.app.usecases.processes import STATEMENTS_VALUE, Commit, Process, Work, stated_document
 from amers.app.usecases.registered_scene import delivered_and_correction
 from amers.app.usecases.results import store_results
 from amers.app.usecases.scene_inputs import check_file_names, check_scene, registered_model_keys
 from amers.app.usecases.stored_scenes import local_scene, stored_scenes
+from amers.services.errors import CoverageError
 from amers.services.formats.images.bands import one_band
 from amers.services.formats.images.ortho import BandForm, SensorGrid, write_cog
 from amers.services.formats.images.raster import RasterImage
 from amers.services.formats.images.tiled_image import TiledImage
 from amers.services.formats.sensor_models.rpc_files import ImageFiles
 from amers.services.map_grid import MapGrid
-from amers.services.orthorectification.rectify import OrthoWindow
 from amers.services.orthorectification.straighten import straighten, without_displacement
 from amers.services.sensors.base import SensorModel
 from amers.services.sensors.correction import CorrectedModel, ImageCorrection
@@ -108,7 +108,7 @@ def run_straightening(
         bands = [raster.with_mix(one_band(band)) for band in raster.validity.image_bands]
         dtype, nodata = pixel_type(raster)
         saturated = next(reversed(raster.saturated_values(1)), None)
-        counter = _Seen()
+        counter = DataPixels(partial(_nothing_shown, source.image))
         windows = counter.count(straighten(bands, correction, progress=progress))
         write_cog(output, grid, windows, BandForm(len(bands), dtype, nodata, saturated))
     finally:
@@ -125,6 +125,10 @@ def run_straightening(
         model=words,
         statements=gathered(one for one in scene.statements if one.subject is not Subject.BANDS),
     )
+
+
+def _nothing_shown(image: Path) -> CoverageError:
+    return CoverageError(f"{image}: no pixel has data: the registration belongs to another image")
 
 
 def _placed(
@@ -146,18 +150,6 @@ def _placed(
         )
     how = "exactly" if fitted.max_error_px == 0.0 else f"within {fitted.max_error_px:.2g} px"
     return SensorGrid(shape, fitted.model), f"an RPC, {how}"
-
-
-@dataclass
-class _Seen:
-    """Counts the pixels with data of windows on their way into the file."""
-
-    pixels: int = 0
-
-    def count(self, windows: Iterator[OrthoWindow]) -> Iterator[OrthoWindow]:
-        for window in windows:
-            self.pixels += int((~np.isnan(window.pixels)).sum())
-            yield window
 
 
 def _check(connection: Connection, caller: Token, inputs: StraightenScene) -> None:

@@ -72,7 +72,7 @@ class AdjustedScene:
 
     @property
     def worst_ce90_px(self) -> float:
-        """CE90 of the worst place that points hold; infinite where they hold none."""
+        """CE90 of the worst place in the held area, relative to the points; infinite without one."""
         if self.held is None or not len(self.held.places):
             return math.inf
         return float(normal_ce90(self.adjustment.covariance_at(self.held.places)).max())
