@@ -2,8 +2,9 @@
 
 import time
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy.typing as npt
@@ -27,8 +28,17 @@ class Effort:
     cpu_s: float = 0.0
 
 
-def _own_thread() -> Executor:
-    return ThreadPoolExecutor(max_workers=1)
+class Here(Executor):
+    """Computes tasks where they are submitted, one after the other."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """A future that is done."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
 
 
 @dataclass(frozen=True)
@@ -43,7 +53,7 @@ class Work:
         effort: of the tasks computed so far, by the first part of their names.
     """
 
-    executor: Executor = field(default_factory=_own_thread)
+    executor: Executor = field(default_factory=Here)
     kept: MutableMapping[str, Arrays] = field(default_factory=dict)
     ahead: int = 2
     effort: dict[str, Effort] = field(default_factory=dict)
@@ -81,6 +91,25 @@ class Work:
         finally:
             for future in pending:
                 future.cancel()
+
+    def results(
+        self, stage: str, function: Callable[..., Arrays], arguments: Sequence[tuple[Any, ...]]
+    ) -> list[Arrays]:
+        """The results of short tasks in their order, which are not kept.
+
+        Args:
+            stage: that counts their effort.
+            function: as in `run`.
+            arguments: of every task.
+        """
+        here = replace(self, kept={})
+        names = [f"{stage}/{number}" for number in range(len(arguments))]
+
+        def given(number: int) -> tuple[Any, ...]:
+            return arguments[number]
+
+        here.run(function, [(name, partial(given, number)) for number, name in enumerate(names)])
+        return [here.kept[name] for name in names]
 
     def _keep_ended(self, pending: dict[Future[tuple[Arrays, float]], str]) -> int:
         ended = wait(pending, return_when=FIRST_COMPLETED).done

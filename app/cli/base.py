@@ -1,22 +1,35 @@
 """`amers base`: bases of control points for a region, from open archives of ortho-images."""
 
 import math
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from amers.app.cli.image_production import WorkOptions
 from amers.app.cli.options import Shown
 from amers.app.cli.output import AsJson, Row, as_size, show_one
-from amers.app.cli.production_rows import accuracy_row
+from amers.app.cli.production_rows import accuracy_row, effort_row
 from amers.app.cli.progress import shown_progress
+from amers.app.cli.transaction import transaction
+from amers.app.config import Settings, read_settings
+from amers.app.storage import Storage, open_storage
+from amers.app.usecases import storage_identity
 from amers.app.usecases.base.making import MadeBase, make_base, plan
 from amers.app.usecases.base.request import BaseOptions, BaseRequest
 from amers.app.usecases.base.search import BasePlan, Candidates
 from amers.app.usecases.base.updating import update_base
+from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.executors import ComputeOptions
+from amers.app.usecases.image_production import WorkPlace
 from amers.app.usecases.new_block import BlockIdentity
 from amers.app.usecases.terrain_file import TerrainFile
 
+Publish = Annotated[
+    bool, typer.Option("--publish", help="Load the block into the store and publish it.")
+]
 Options = Annotated[
     BaseOptions,
     Shown(
@@ -67,10 +80,8 @@ def make(
     ] = None,
     options: Options,
     identity: BlockIdentity,
-    work: Annotated[
-        Path | None,
-        typer.Option(help="Folder that keeps what was read; by default OUTPUT.work until the end."),
-    ] = None,
+    place: WorkOptions,
+    publish: Publish = False,
     only_plan: Annotated[
         bool, typer.Option("--plan", help="Print dates, bytes and time, and read no image.")
     ] = False,
@@ -79,14 +90,23 @@ def make(
     """Make a base of control points for a region from an open archive of images, in one go."""
     terrain = None if dem is None else TerrainFile(dem, vertical, geoid)
     request = BaseRequest(source, tuple(catalogue), area, bbox, scene, terrain, geoid, since)
-    with shown_progress() as progress:
-        if not only_plan:
-            named = identity.named_after(output)
-            made = make_base(request, output, named, options, work=work, progress=progress)
-        else:
+    if only_plan:
+        with shown_progress() as progress:
             planned, candidates = plan(request, options, progress)
-    row = _plan_row(planned, candidates) if only_plan else _made_row(output, made, as_json=as_json)
-    show_one(row, as_json=as_json)
+        show_one(_plan_row(planned, candidates), as_json=as_json)
+        return
+    put = _publication(output) if publish else None
+    with shown_progress() as progress:
+        made = make_base(
+            request,
+            output,
+            identity.named_after(output),
+            options,
+            place=WorkPlace(place.work, ComputeOptions(place.jobs, place.cluster)),
+            put=put,
+            progress=progress,
+        )
+    show_one(_made_row(output, made, publish, as_json=as_json), as_json=as_json)
 
 
 def update(
@@ -102,9 +122,12 @@ def update(
     version: Annotated[
         str | None, typer.Option(help="Version of the block; by default the next number.")
     ] = None,
+    compute: Annotated[WorkOptions, Shown(jobs=None, cluster=None)],
+    publish: Publish = False,
     as_json: AsJson = False,
 ) -> None:
     """Make the next version of a base: new dates become views, vanished points leave, gaps fill."""
+    put = _publication(output) if publish else None
     with shown_progress() as progress:
         made = update_base(
             work,
@@ -112,9 +135,37 @@ def update(
             catalogues=tuple(catalogue or ()),
             new_dates=new_dates,
             version=version,
+            compute=ComputeOptions(compute.jobs, compute.cluster),
+            put=put,
             progress=progress,
         )
-    show_one(_made_row(output, made, as_json=as_json), as_json=as_json)
+    show_one(_made_row(output, made, publish, as_json=as_json), as_json=as_json)
+
+
+@dataclass(frozen=True)
+class _Publication:
+    """Loads a whole block into the store, publishes it, and moves it into its folder."""
+
+    folder: Path
+    settings: Settings
+    storage: Storage
+
+    def __call__(self, whole: Path) -> None:
+        with transaction(self.settings) as connection:
+            block = lifecycle.ingest_block(connection, self.storage, whole).block
+            lifecycle.publish_block(connection, str(block.number))
+            # Before the end of the transaction: a command that is interrupted here can be given again.
+            whole.rename(self.folder)
+
+
+def _publication(folder: Path) -> _Publication:
+    """What publishes a block of this folder; the store is checked before the work."""
+    settings = read_settings()
+    storage = open_storage(settings)
+    with transaction(settings):
+        storage_identity.announce(partial(transaction, settings), storage)
+        storage.prove()
+    return _Publication(folder, settings, storage)
 
 
 def _plan_row(planned: BasePlan, candidates: Candidates) -> Row:
@@ -135,10 +186,11 @@ def _plan_row(planned: BasePlan, candidates: Candidates) -> Row:
     }
 
 
-def _made_row(output: Path, made: MadeBase, *, as_json: bool) -> Row:
+def _made_row(output: Path, made: MadeBase, published: bool, *, as_json: bool) -> Row:
     frames = made.placed.frames
     return {
         "block": output,
+        **({"state": "published"} if published else {}),
         "points": len(made.points),
         "views": int(made.points.views.start[-1]),
         "points_per_km2": round(len(made.points) / made.area_km2, 2),
@@ -157,6 +209,8 @@ def _made_row(output: Path, made: MadeBase, *, as_json: bool) -> Row:
         "bytes_read": made.bytes,
         "bytes_per_km2": round(made.bytes / made.area_km2),
         "share_of_full_tiles": round(made.pixels / max(1, made.full_pixels), 4),
+        "cpu_s_per_point": round(made.cpu_s / len(made.points), 3),
+        **effort_row(made.effort, as_json=as_json),
         **accuracy_row(made.points, as_json=as_json),
         "left_out": made.left_out,
         "attribution": made.attribution,

@@ -18,6 +18,7 @@ from amers.services.production.detail_points import detail_points, detail_salien
 from amers.services.production.point_views import check_image_names, chips_of
 from amers.services.production.view_agreement import AgreedViews, agreed_views, refuse
 from amers.services.statements import Statements
+from amers.services.tasks import Arrays, Work
 from amers.services.terrain import Terrain
 from amers.services.types import (
     Array,
@@ -139,6 +140,7 @@ def produce_ortho_points(
     *,
     wanted: Callable[[Array], BoolArray] = everywhere,
     not_found: Callable[[AmersError], None] = refuse,
+    work: Work | None = None,
 ) -> OrthoPoints:
     """Control points with chips, produced from ortho-images of one place and the heights of its ground.
 
@@ -158,6 +160,7 @@ def produce_ortho_points(
         progress: receives the fraction done.
         wanted: whether the squares with centres (n, 2), longitude and latitude, need a point.
         not_found: receives the error of an image in which the points are not found, see `agreed_views`.
+        work: see `agreed_views`.
 
     Raises:
         InputError: a scene has a parallax, so that it is no ortho-image, or two have one name.
@@ -175,7 +178,8 @@ def produce_ortho_points(
     search = part_of(progress, 0.0, 0.9 if len(scenes) == 1 else 0.5)
     corners = _corners(scenes, heights, squares, gsds_m[0], options, progress=search)
     lon_lat_h = np.array([corner.lon_lat_h for corner in corners]).reshape(-1, 3)
-    agreed = agreed_views(scenes, lon_lat_h, gsds_m[0], part_of(progress, 0.5, 0.4), not_found=not_found)
+    searching = part_of(progress, 0.5, 0.4)
+    agreed = agreed_views(scenes, lon_lat_h, gsds_m[0], searching, not_found, work=work)
     _check_one_place(scenes, agreed, not_found)
     rows = _best_of_squares(corners, agreed, options)
     if len(rows) < _MIN_POINTS:
@@ -207,6 +211,7 @@ def shifts_of_scenes(
     heights: GroundHeights,
     options: OrthoPointOptions = OrthoPointOptions(),
     progress: Progress = no_progress,
+    work: Work | None = None,
 ) -> Array:
     """Shifts (n, 2) east, north, metres, by which ortho-images lie off the first; NaN where not found.
 
@@ -221,17 +226,20 @@ def shifts_of_scenes(
     squares = _squares(scenes[0], scene_gsd_m(scenes[0]), options)
     corners = _corners(scenes[:1], heights, squares, gsds_m[0], options, progress=no_progress)
     lon_lat_h = np.array([corner.lon_lat_h for corner in corners]).reshape(-1, 3)
-    shift_m = np.full((len(scenes), 2), np.nan)
-    shift_m[0] = 0.0
-    for k in range(1, len(scenes)):
-        progress(k / len(scenes), f"comparing {len(scenes)} images")
-        try:
-            agreed = agreed_views([scenes[0], scenes[k]], lon_lat_h, gsds_m[0])
-        except NotEnoughPoints:
-            continue
-        if agreed.tied[1]:
-            shift_m[k] = agreed.shift_m[1]
-    return shift_m
+    progress(0.0, f"comparing {len(scenes)} images")
+    tasks = [(scenes[0], other, lon_lat_h, gsds_m[0]) for other in scenes[1:]]
+    results = (work or Work()).results("shifts", shift_task, tasks)
+    return np.stack([np.zeros(2), *(one["shift_m"] for one in results)])
+
+
+def shift_task(first: Scene, other: Scene, lon_lat_h: Array, gsd_m: float) -> Arrays:
+    """Shift (2,) east, north, metres, of an image against the first; NaN where it is not found."""
+    shift_m = np.full(2, np.nan)
+    try:
+        agreed = agreed_views([first, other], lon_lat_h, gsd_m)
+    except NotEnoughPoints:
+        return {"shift_m": shift_m}
+    return {"shift_m": agreed.shift_m[1] if agreed.tied[1] else shift_m}
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from amers.services.sensors.base import SensorModel
 from amers.services.sensors.correction import CorrectedModel, fold_into_rpc, no_correction
 from amers.services.sensors.ortho import OrthoModel, fold_into_ortho
 from amers.services.sensors.rpc import RpcModel
+from amers.services.tasks import Arrays, Work
 from amers.services.types import Array, BoolArray, IntArray, Observations, Progress, no_progress
 
 _SEARCH = RefinementOptions()
@@ -33,6 +34,8 @@ _CONSENSUS_PX = 2.0
 """Displacements this close to each other agree."""
 _MAX_DEVIATION = 4.0
 """Largest deviation of a view from the shift of its image, in standard deviations."""
+_OF_TASK = 64
+"""Points of a task."""
 _NORMAL_MAD = 1.4826
 """Standard deviation of a normal law over its median absolute deviation."""
 
@@ -98,6 +101,8 @@ def agreed_views(
     gsd_m: float,
     progress: Progress = no_progress,
     not_found: Callable[[AmersError], None] = refuse,
+    *,
+    work: Work | None = None,
 ) -> AgreedViews:
     """The views of points in several images, of which the first that shows a point defines its detail.
 
@@ -113,13 +118,15 @@ def agreed_views(
         progress: receives the fraction done.
         not_found: receives the error of an image in which points are not found: by default it is raised;
             otherwise the image gives no views.
+        work: computes chips and displacements; by default here.
 
     Raises:
         NotEnoughPoints: an image shows the points of earlier ones, but they are not found in it.
     """
-    whole = _whole_chips(scenes, lon_lat_h, gsd_m)
+    work = work or Work()
+    whole = _whole_chips(scenes, lon_lat_h, gsd_m, work)
     reference = np.where(whole.any(axis=0), np.argmax(whole, axis=0), -1).astype(np.int64)
-    search = _Search(list(scenes), reference, lon_lat_h)
+    search = _Search(list(scenes), reference, lon_lat_h, work)
     shift_m, tied = np.zeros((len(scenes), 2)), np.arange(len(scenes)) == 0
     pairs = [(int(row), int(image)) for row, image in enumerate(reference) if image >= 0]
     measures, variance_sum_m2 = 0, 0.0
@@ -154,13 +161,48 @@ def agreed_views(
     )
 
 
-def _whole_chips(scenes: Sequence[Scene], lon_lat_h: Array, gsd_m: float) -> BoolArray:
+def _whole_chips(scenes: Sequence[Scene], lon_lat_h: Array, gsd_m: float, work: Work) -> BoolArray:
     """Which images show the whole chips of which points (k, n), at most a tenth of it missing."""
-    whole = np.stack([chip_inside(s.model, s.image.shape, lon_lat_h, gsd_m) for s in scenes])
-    for k, row in np.argwhere(whole):
-        chip = render_chip(scenes[k].image, scenes[k].model, lon_lat_h[row], gsd_m)
-        whole[k, row] = nearly_whole(chip)
-    return whole
+    parts = _parts(len(lon_lat_h))
+    tasks = [(scene, lon_lat_h[part], gsd_m) for scene in scenes for part in parts]
+    whole = [one["whole"] for one in work.results("chips", whole_task, tasks)]
+    return np.concatenate([np.empty(0, dtype=np.bool_), *whole]).reshape(len(scenes), len(lon_lat_h))
+
+
+def whole_task(scene: Scene, lon_lat_h: Array, gsd_m: float) -> Arrays:
+    """Whether an image shows the whole chips (n,) of points (n, 3)."""
+    whole = chip_inside(scene.model, scene.image.shape, lon_lat_h, gsd_m)
+    for row in np.flatnonzero(whole):
+        chip = render_chip(scene.image, scene.model, lon_lat_h[row], gsd_m)
+        whole[row] = nearly_whole(chip)
+    return {"whole": whole}
+
+
+def displacement_task(
+    first: Scene, scene: Scene, lon_lat_h: Array, gsd_m: float, radius_px: int
+) -> Arrays:
+    """The rows (m,) of points (n, 3) of one image that are found in another, and where.
+
+    Displacements (m, 2) are metres east and north of their place. Distances of the search are pixels of
+    the chips, whose ground sampling is in metres.
+    """
+    found, off_m = [], []
+    for row, ground in enumerate(lon_lat_h):
+        patch = render_chip(scene.image, scene.model, ground, gsd_m, CHIP_SIZE + 2 * radius_px)
+        chip = render_chip(first.image, first.model, ground, gsd_m)
+        peak = find_chip(patch, chip, _SEARCH.correlation)
+        if peak.reason == FOUND:
+            found.append(row)
+            off_m.append((peak.row_col[1] * gsd_m, -peak.row_col[0] * gsd_m))
+    return {
+        "row": np.array(found, dtype=np.int64),
+        "off_m": np.array(off_m, dtype=np.float64).reshape(-1, 2),
+    }
+
+
+def _parts(count: int) -> list[slice]:
+    """The points of every task."""
+    return [slice(first, first + _OF_TASK) for first in range(0, count, _OF_TASK)]
 
 
 @dataclass(frozen=True)
@@ -170,6 +212,7 @@ class _Search:
     placed: list[Scene]
     reference: IntArray
     lon_lat_h: Array
+    work: Work
 
     def agreement(self, scene: Scene, rows: IntArray, gsd_m: float) -> tuple[Array, IntArray, float]:
         """Where a later image lies (2,), the rows that agree (m,), and their standard deviation.
@@ -209,16 +252,17 @@ class _Search:
         self, scene: Scene, rows: IntArray, gsd_m: float, radius_px: int
     ) -> tuple[IntArray, Array]:
         """The points found (m,) of some rows, and where (m, 2): metres east and north of their place."""
-        found, off_m = [], []
-        for row in rows:
-            first, ground = self.placed[self.reference[row]], self.lon_lat_h[row]
-            patch = render_chip(scene.image, scene.model, ground, gsd_m, CHIP_SIZE + 2 * radius_px)
-            chip = render_chip(first.image, first.model, ground, gsd_m)
-            peak = find_chip(patch, chip, _SEARCH.correlation)
-            if peak.reason == FOUND:
-                found.append(row)
-                off_m.append((peak.row_col[1] * gsd_m, -peak.row_col[0] * gsd_m))
-        return np.array(found, dtype=np.int64), np.array(off_m, dtype=np.float64).reshape(-1, 2)
+        parts, tasks = [], []
+        for image in np.unique(self.reference[rows]).tolist():
+            of_image = rows[self.reference[rows] == image]
+            for part in _parts(len(of_image)):
+                parts.append(of_image[part])
+                ground = self.lon_lat_h[of_image[part]]
+                tasks.append((self.placed[image], scene, ground, gsd_m, radius_px))
+        results = self.work.results("search", displacement_task, tasks)
+        found = np.concatenate([part[one["row"]] for part, one in zip(parts, results, strict=True)])
+        order = np.argsort(found)
+        return found[order], np.concatenate([one["off_m"] for one in results])[order]
 
 
 def _moved(scene: Scene, lon_lat_h: Array, shift_m: Array) -> Scene:

@@ -20,6 +20,7 @@ from amers.app.errors import InputError
 from amers.app.usecases.base import making
 from amers.app.usecases.base.making import MadeBase, make_base, plan
 from amers.app.usecases.base.request import BaseOptions, BaseRequest
+from amers.app.usecases.image_production import WorkPlace
 from amers.app.usecases.new_block import BlockIdentity
 from amers.services.formats import addresses
 from amers.services.formats.addresses import Address
@@ -320,7 +321,7 @@ def test_an_update_reads_new_dates_alone_and_drops_what_they_contradict(archive,
             tmp_path / "a",
             BlockIdentity("b"),
             FEW,
-            work=work,
+            place=WorkPlace(work),
         )
     gone = read_block(tmp_path / "a").points.lon_lat_h[0]
     (new.folder / "data").unlink()

@@ -13,6 +13,7 @@ from amers.app.errors import InputError
 from amers.app.usecases.base.making import MadeBase, make_base
 from amers.app.usecases.base.request import BaseOptions, BaseRequest, area_of
 from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.image_production import WorkPlace
 from amers.app.usecases.new_block import BlockIdentity
 from amers.app.usecases.processes import Commit, Process, Work, work_folder
 from amers.app.usecases.server_files import file_below
@@ -91,7 +92,8 @@ def _run(work: Work) -> Commit:
     folder = Path(scratch.name) / "block"
     with work.storage.lasting_folder(work_folder(work.job.id)) as kept:
         progress = part_of(work.progress, 0.0, 0.9)
-        made = make_base(request, folder, identity, options, work=kept / "base", progress=progress)
+        place = WorkPlace(kept / "base")
+        made = make_base(request, folder, identity, options, place=place, progress=progress)
 
     def commit(connection: Connection) -> dict[str, Any]:
         with scratch:

@@ -3,7 +3,7 @@
 import json
 import math
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -31,6 +31,8 @@ from amers.app.usecases.base.tile_points import (
     points_of_tiles,
 )
 from amers.app.usecases.base.windows import WindowReader, read_terrain_windows
+from amers.app.usecases.executors import ComputeOptions, open_executor
+from amers.app.usecases.image_production import WorkPlace
 from amers.app.usecases.new_block import (
     BlockIdentity,
     block_metadata,
@@ -48,11 +50,15 @@ from amers.services.imagery.archives import COPERNICUS_DEM, Archive
 from amers.services.production.date_choice import TileArea
 from amers.services.production.joined_points import TilePoints, joined_points
 from amers.services.production.ortho_production import GroundHeights
+from amers.services.tasks import Effort, Work
 from amers.services.types import ControlPoints, Frame, Progress, no_progress, part_of
 
 CANDIDATES, CHOSEN = "candidates.json", "chosen.json"
 """Files of a work folder: what catalogues have, and what the last block was made of."""
-_OPTIONS = BaseOptions()
+_OPTIONS, _HERE = BaseOptions(), WorkPlace()
+
+PutBlock = Callable[[Path], object]
+"""Moves a whole block, which lies beside its folder, into it: one that is published, for example."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +74,7 @@ class MadeBase:
         pixels, full_pixels: read, and of the whole images.
         local_sigma_m: of details; NaN when unknown.
         attribution: of the data.
+        effort: of the tasks, by their stage.
     """
 
     points: ControlPoints
@@ -79,6 +86,12 @@ class MadeBase:
     full_pixels: int
     local_sigma_m: float
     attribution: str
+    effort: dict[str, Effort]
+
+    @property
+    def cpu_s(self) -> float:
+        """Seconds of a core that all tasks took."""
+        return sum(one.cpu_s for one in self.effort.values())
 
     @property
     def images(self) -> int:
@@ -144,7 +157,8 @@ def make_base(
     identity: BlockIdentity,
     options: BaseOptions = _OPTIONS,
     *,
-    work: Path | None = None,
+    place: WorkPlace = _HERE,
+    put: PutBlock | None = None,
     progress: Progress = no_progress,
 ) -> MadeBase:
     """Make a base and write its block; an interrupted one goes on when it is made again.
@@ -154,7 +168,8 @@ def make_base(
         folder: of the block; must not exist.
         identity: of the block.
         options: of dates and points.
-        work: folder that keeps what was read; by default beside the block, and deleted at the end.
+        place: of the work; its folder keeps what was read.
+        put: moves the whole block into its folder.
         progress: receives the fraction done and a message.
 
     Raises:
@@ -163,7 +178,7 @@ def make_base(
     """
     refuse_existing(folder)
     making = Making(request, options, area_of(request), archive_of(request.source))
-    kept = work or folder.with_name(f"{folder.name}.work")
+    kept = place.folder or folder.with_name(f"{folder.name}.work")
     WorkFolder(kept, _inputs(making))
     (kept / "images").mkdir(exist_ok=True)
     if not (kept / CANDIDATES).is_file():
@@ -175,9 +190,9 @@ def make_base(
         kept / "images", making.archive, candidates, options, reading, len(planned.dates)
     )
     chosen = chosen_dates(candidates, planned.tiles, options, reader.take)
-    finishing = Finishing(making, reader, planned.tiles, chosen, frozenset())
-    made = finishing.write(folder, identity, part_of(progress, 0.5, 0.5))
-    if work is None:
+    finishing = Finishing(making, reader, planned.tiles, chosen, frozenset(), place.compute)
+    made = finishing.write(folder, identity, put, part_of(progress, 0.5, 0.5))
+    if place.folder is None:
         shutil.rmtree(kept)
     else:
         finishing.remember(kept / CHOSEN, identity)
@@ -194,6 +209,7 @@ class Finishing:
         tiles: parts of the region.
         chosen: numbers of the images of every tile.
         recent: ids of images that must show a point for it to stay.
+        compute: where tasks are computed.
     """
 
     making: Making
@@ -201,9 +217,12 @@ class Finishing:
     tiles: list[TileArea]
     chosen: dict[str, list[int]]
     recent: frozenset[str]
+    compute: ComputeOptions
 
-    def write(self, folder: Path, identity: BlockIdentity, progress: Progress) -> MadeBase:
-        """Make the points and write the block.
+    def write(
+        self, folder: Path, identity: BlockIdentity, put: PutBlock | None, progress: Progress
+    ) -> MadeBase:
+        """Make the points, write the block beside its folder, and put it there.
 
         Raises:
             InputError: heights cannot be used.
@@ -211,17 +230,26 @@ class Finishing:
         """
         making, reader = self.making, self.reader
         with ExitStack() as stack:
+            executor, ahead = stack.enter_context(open_executor(self.compute))
+            work = Work(executor, ahead=ahead)
             tiles = opened_tiles(self.tiles, self.chosen, reader, stack)
             heights = making.heights(reader.candidates, self.tiles, reader.folder.parent)
             gsd_m = making.archive.gsd_m
-            placed = placed_dates(tiles, heights, gsd_m, part_of(progress, 0.0, 0.2))
-            parts = points_of_tiles(placed, heights, reader, self.recent, part_of(progress, 0.2, 0.6))
+            placed = placed_dates(tiles, heights, gsd_m, work, part_of(progress, 0.0, 0.2))
+            searching = part_of(progress, 0.2, 0.6)
+            parts = points_of_tiles(placed, heights, reader, self.recent, work=work, progress=searching)
             frame = Frame.from_sigmas(placed.frames.sigma_m, heights.frame_sigma_m)
             least_m = 0.7 * spacing_m(making.options, making.archive, area_km2(making.area))
             points, chips = joined_points(parts, heights, frame, least_m)
-            made = _made(making, points, placed, reader, parts)
+            made = _made(making, points, placed, reader, parts, effort=work.effort)
             metadata = _metadata(identity, making, made, parts[0].production.gsds_m)
-            write_block(folder, metadata, points, chips, {}, progress=part_of(progress, 0.8, 0.2))
+            whole = folder.with_name(f"{folder.name}.whole")
+            shutil.rmtree(whole, ignore_errors=True)
+            write_block(whole, metadata, points, chips, {}, progress=part_of(progress, 0.8, 0.2))
+        if put is None:
+            whole.rename(folder)
+        else:
+            put(whole)
         return made
 
     def remember(self, path: Path, identity: BlockIdentity) -> None:
@@ -256,6 +284,8 @@ def _made(
     placed: PlacedDates,
     reader: WindowReader,
     parts: list[TilePoints],
+    *,
+    effort: dict[str, Effort],
 ) -> MadeBase:
     local_m = np.array([part.production.local_sigma_m for part in parts])
     images = [image for tile in placed.tiles for image in tile.images]
@@ -274,6 +304,7 @@ def _made(
         full_pixels=reader.full_pixels,
         local_sigma_m=float(np.nanmax(local_m)) if np.isfinite(local_m).any() else math.nan,
         attribution=attribution,
+        effort=effort,
     )
 
 

@@ -28,6 +28,7 @@ from amers.services.production.ortho_production import (
     produce_ortho_points,
     shifts_of_scenes,
 )
+from amers.services.tasks import Work
 from amers.services.types import Array, BoolArray, Progress, part_of
 
 _TIE_POINTS = 80
@@ -109,7 +110,10 @@ def opened_tiles(
             scene = read_scene(reader.path(number), sigma_m=image.accuracy.total_m)
             stack.callback(scene.image.close)  # type: ignore[attr-defined]
             acquisition = replace(
-                scene.acquisition, sensor=image.platform, acquired_at=image.acquired, image_id=image.id
+                scene.acquisition,
+                sensor=image.platform,
+                acquired_at=image.acquired,
+                image_id=image.id,
             )
             scenes.append(replace(scene, acquisition=acquisition))
         if scenes:
@@ -123,7 +127,7 @@ def opened_tiles(
 
 
 def placed_dates(
-    tiles: Sequence[BaseTile], heights: GroundHeights, gsd_m: float, progress: Progress
+    tiles: Sequence[BaseTile], heights: GroundHeights, gsd_m: float, work: Work, progress: Progress
 ) -> PlacedDates:
     """The frame of all dates, from the shifts of the images of every tile against its first."""
     few = OrthoPointOptions(gsd_m, COARSE_FACTOR * gsd_m, points=_TIE_POINTS)
@@ -132,7 +136,7 @@ def placed_dates(
     left_out: list[str] = []
     for number, tile in enumerate(tiles):
         part = part_of(progress, number / len(tiles), 1.0 / len(tiles))
-        tile, shift_m = _tied(tile, heights, few, part)
+        tile, shift_m = _tied(tile, heights, few, work, part)
         found = np.isfinite(shift_m[:, 0])
         for image, is_found in zip(tile.images, found.tolist(), strict=True):
             if not is_found:
@@ -153,14 +157,14 @@ def placed_dates(
 
 
 def _tied(
-    tile: BaseTile, heights: GroundHeights, options: OrthoPointOptions, progress: Progress
+    tile: BaseTile, heights: GroundHeights, options: OrthoPointOptions, work: Work, progress: Progress
 ) -> tuple[BaseTile, Array]:
     """A tile with the first image in which most others are found, and their shifts (n, 2) against it."""
     best: tuple[BaseTile, Array] | None = None
     count = 0
     for row in range(min(_MOST_FIRST, len(tile.scenes))):
         turned = tile.take([row, *(i for i in range(len(tile.scenes)) if i != row)])
-        shift_m = shifts_of_scenes(turned.scenes, heights, options, progress)
+        shift_m = shifts_of_scenes(turned.scenes, heights, options, progress, work)
         found = int(np.isfinite(shift_m[:, 0]).sum())
         if best is None or found > count:
             best, count = (turned, shift_m), found
@@ -175,6 +179,8 @@ def points_of_tiles(
     heights: GroundHeights,
     reader: WindowReader,
     recent: frozenset[str],
+    *,
+    work: Work,
     progress: Progress,
 ) -> list[TilePoints]:
     """The points of every tile, with the way into the frame of the base.
@@ -184,6 +190,7 @@ def points_of_tiles(
         heights: of the ground.
         reader: of the images.
         recent: ids of images of which one must show a point, where two could; see `still_found`.
+        work: computes the tasks.
         progress: receives the fraction done and a message.
 
     Raises:
@@ -198,7 +205,7 @@ def points_of_tiles(
     parts = []
     for number, tile in enumerate(placed.tiles):
         part = part_of(progress, number / len(placed.tiles), 1.0 / len(placed.tiles))
-        for row, production in _productions(tile, heights, options, step_m, part):
+        for row, production in _productions(tile, heights, options, step_m, work=work, progress=part):
             move_m = placed.move_m(tile.images[row])
             latest = [scene for scene in tile.scenes if scene.acquisition.image_id in recent]
             rows = still_found(production, latest)
@@ -224,7 +231,13 @@ def _without_views(error: AmersError) -> None:
 
 
 def _productions(
-    tile: BaseTile, heights: GroundHeights, options: OrthoPointOptions, step_m: float, progress: Progress
+    tile: BaseTile,
+    heights: GroundHeights,
+    options: OrthoPointOptions,
+    step_m: float,
+    *,
+    work: Work,
+    progress: Progress,
 ) -> list[tuple[int, OrthoPoints]]:
     """Points of a tile: of its first image, then of others in squares that have none."""
     made: list[tuple[int, OrthoPoints]] = []
@@ -246,7 +259,7 @@ def _productions(
         part = part_of(progress, row / _MOST_FIRST, 1.0 / _MOST_FIRST)
         try:
             production = produce_ortho_points(
-                scenes, heights, options, part, wanted=wanted, not_found=_without_views
+                scenes, heights, options, part, wanted=wanted, not_found=_without_views, work=work
             )
         except NotEnoughPoints:
             continue

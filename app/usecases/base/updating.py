@@ -9,16 +9,18 @@ import numpy as np
 import shapely
 
 from amers.app.errors import InputError
-from amers.app.usecases.base.making import CANDIDATES, CHOSEN, Finishing, MadeBase, Making
+from amers.app.usecases.base.making import CANDIDATES, CHOSEN, Finishing, MadeBase, Making, PutBlock
 from amers.app.usecases.base.request import BaseOptions, BaseRequest, archive_of
 from amers.app.usecases.base.search import Candidates, read_candidates, write_candidates
 from amers.app.usecases.base.windows import WindowReader
+from amers.app.usecases.executors import ComputeOptions
 from amers.app.usecases.new_block import BlockIdentity, refuse_existing
 from amers.app.usecases.terrain_file import TerrainFile
 from amers.services.production.date_choice import TileArea, choose_dates, places_in
 from amers.services.types import Progress, no_progress, part_of
 
 _INPUTS = "inputs.json"
+_HERE = ComputeOptions()
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,8 @@ def update_base(
     catalogues: tuple[str, ...] = (),
     new_dates: int = 2,
     version: str | None = None,
+    compute: ComputeOptions = _HERE,
+    put: PutBlock | None = None,
     progress: Progress = no_progress,
 ) -> MadeBase:
     """Make the next version of a base from what was read for the last one, and from newer images.
@@ -51,6 +55,8 @@ def update_base(
         catalogues: to search in place of those of the base.
         new_dates: number of dates that each place gets.
         version: of the block; by default the next number.
+        compute: where tasks are computed.
+        put: moves the whole block into its folder.
         progress: receives the fraction done and a message.
 
     Raises:
@@ -71,8 +77,8 @@ def update_base(
     chosen, recent = _chosen(before, reader, new_dates)
     tiles = [_tile_area(name, polygon, candidates) for name, polygon in before.tiles.items()]
     identity = replace(before.identity, version=version or _next(before.identity.version))
-    finishing = Finishing(making, reader, tiles, chosen, recent)
-    made = finishing.write(folder, identity, part_of(progress, 0.5, 0.5))
+    finishing = Finishing(making, reader, tiles, chosen, recent, compute)
+    made = finishing.write(folder, identity, put, part_of(progress, 0.5, 0.5))
     finishing.remember(work / CHOSEN, identity)
     return made
 
