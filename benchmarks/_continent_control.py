@@ -18,13 +18,12 @@ from rasterio.transform import Affine
 from amers.services.formats.block.document import BlockMetadata, BlockSpecification, Provenance
 from amers.services.formats.block.writer import write_block
 from amers.services.formats.images.ortho import gdal_transform
-from amers.services.geodesy import box_around, metres_per_degree, move_metres
+from amers.services.geodesy import box_around, metres_per_degree, move_metres, sun_direction
 from amers.services.imagery.scene import Scene
 from amers.services.map_grid import MapGrid
 from amers.services.simulation.archive import season_of
 from amers.services.simulation.land import WATER
 from amers.services.simulation.light import averaged, day_of, radiance
-from amers.services.simulation.orbit import sun_direction
 from amers.services.simulation.render import digitise
 from amers.services.simulation.view import PLAIN_RADIOMETRY
 from amers.services.simulation.world import World, natural_noise

@@ -17,7 +17,7 @@ import numpy as np
 
 from amers.services.adjustment.intersection import intersect
 from amers.services.formats.images.scenes import read_scene
-from amers.services.geodesy import metres_per_degree_at, move_metres
+from amers.services.geodesy import metres_per_degree_at, move_metres, sun_direction
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ImageSource, render_chip
 from amers.services.matching.correlate import FOUND, CorrelationOptions, find_chip
@@ -25,7 +25,6 @@ from amers.services.matching.multi_image import refine_on_chips
 from amers.services.quality.accuracy import accuracy, normalised_error
 from amers.services.quality.normal_law import LINEAR_LE90, normal_ce90
 from amers.services.simulation.archive import ArchiveView
-from amers.services.simulation.orbit import sun_direction
 from amers.services.simulation.render import Radiometry
 from amers.services.simulation.tiles import TiledView
 from amers.services.simulation.view import ViewGeometry

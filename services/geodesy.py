@@ -1,9 +1,10 @@
-"""Conversions between geodetic, Earth-centred and local cartesian coordinates on WGS 84.
+"""Conversions between geodetic, Earth-centred and local cartesian coordinates on WGS 84; the sun.
 
 The scalar functions are compiled for calls from other kernels; all other code uses the array functions.
 """
 
 import math
+from datetime import datetime
 
 import numpy as np
 from numba import njit
@@ -168,3 +169,28 @@ def move_metres(lon_lat_h: Array, enu: Array) -> Array:
         out[i, 1] = lon_lat_h[i, 1] + enu[i, 1] / north
         out[i, 2] = lon_lat_h[i, 2] + enu[i, 2]
     return out
+
+
+def sun_direction(lon_lat: Array, when: datetime) -> tuple[float, float]:
+    """Elevation and azimuth of the sun in degrees, accurate to about half a degree.
+
+    Source: the low-precision formulas of the Astronomical Almanac.
+
+    Args:
+        lon_lat: (2,) degrees.
+        when: time, UTC.
+    """
+    days = (when.replace(tzinfo=None) - datetime(2000, 1, 1, 12)).total_seconds() / 86400.0
+    anomaly = np.radians(357.528 + 0.9856003 * days)
+    longitude = np.radians(
+        280.460 + 0.9856474 * days + 1.915 * np.sin(anomaly) + 0.020 * np.sin(2.0 * anomaly)
+    )
+    obliquity = np.radians(23.439)
+    ascension = np.arctan2(np.cos(obliquity) * np.sin(longitude), np.cos(longitude))
+    declination = np.arcsin(np.sin(obliquity) * np.sin(longitude))
+    sidereal = np.radians(280.46062 + 360.98564737 * days + lon_lat[0])
+    hour, lat = sidereal - ascension, np.radians(lon_lat[1])
+    up = np.sin(lat) * np.sin(declination) + np.cos(lat) * np.cos(declination) * np.cos(hour)
+    east = -np.cos(declination) * np.sin(hour)
+    north = np.cos(lat) * np.sin(declination) - np.sin(lat) * np.cos(declination) * np.cos(hour)
+    return float(np.degrees(np.arcsin(up))), float(np.degrees(np.arctan2(east, north)) % 360.0)

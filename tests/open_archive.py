@@ -19,13 +19,12 @@ import rasterio
 import shapely
 from rasterio.transform import Affine
 
-from amers.services.geodesy import metres_per_degree
+from amers.services.geodesy import metres_per_degree, sun_direction
 from amers.services.imagery.archives import COPERNICUS_DEM, SENTINEL_2, ArchiveImage
 from amers.services.map_grid import lon_lat_of_xy, xy_of_lon_lat
 from amers.services.simulation.conditions import clouds_over
 from amers.services.simulation.grid import bilinear_values
 from amers.services.simulation.light import day_of, radiance
-from amers.services.simulation.orbit import sun_direction
 from amers.services.simulation.world import World, make_world, natural_noise
 from amers.services.types import Array
 

@@ -108,6 +108,7 @@ class ArchiveImage:
         baseline: processing baseline; "" when unknown.
         footprint: longitude and latitude.
         cloud, snow: shares, 0 to 1; 0 when unknown.
+        sun_deg: elevation and azimuth of the sun.
         offset: added to pixel values.
         accuracy: what the producer states.
     """
@@ -121,6 +122,7 @@ class ArchiveImage:
     footprint: shapely.Geometry
     cloud: float
     snow: float
+    sun_deg: tuple[float, float]
     offset: float
     accuracy: StatedAccuracy
 

@@ -42,9 +42,11 @@ def shadow_shift(chip: Acquisition, scene: Acquisition, gsd_m: float) -> ShadowS
 
 
 def shadow_vector(image: Acquisition) -> Array:
-    """East and north (2,) of the shadow of an object of unit height; NaN when the sun is unknown."""
+    """East and north (2,) of the shadow of an object of unit height; NaN without a known sun."""
     azimuth = np.radians(image.sun_azimuth_deg + 180.0)
-    length = np.tan(np.radians(90.0 - image.sun_elevation_deg))
+    length = (
+        np.tan(np.radians(90.0 - image.sun_elevation_deg)) if image.sun_elevation_deg > 0.0 else np.nan
+    )
     return np.asarray(length * np.array([np.sin(azimuth), np.cos(azimuth)]))
 
 

@@ -1,7 +1,6 @@
 """Simulated orbits: a pushbroom satellite that views a target from a given direction."""
 
 import math
-from datetime import datetime
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -103,31 +102,6 @@ def _oscillation(times: Array, amplitude: float, rng: np.random.Generator | None
     phase = rng.uniform(0.0, 2.0 * np.pi, 3) if rng else np.zeros(3)
     angles = np.sin(2.0 * np.pi * JITTER_HZ * times[:, None] + phase)
     return Rotation.from_rotvec(amplitude * angles)
-
-
-def sun_direction(lon_lat: Array, when: datetime) -> tuple[float, float]:
-    """Elevation and azimuth of the sun in degrees, accurate to about half a degree.
-
-    Source: the low-precision formulas of the Astronomical Almanac.
-
-    Args:
-        lon_lat: (2,) degrees.
-        when: time, UTC.
-    """
-    days = (when.replace(tzinfo=None) - datetime(2000, 1, 1, 12)).total_seconds() / 86400.0
-    anomaly = np.radians(357.528 + 0.9856003 * days)
-    longitude = np.radians(
-        280.460 + 0.9856474 * days + 1.915 * np.sin(anomaly) + 0.020 * np.sin(2.0 * anomaly)
-    )
-    obliquity = np.radians(23.439)
-    ascension = np.arctan2(np.cos(obliquity) * np.sin(longitude), np.cos(longitude))
-    declination = np.arcsin(np.sin(obliquity) * np.sin(longitude))
-    sidereal = np.radians(280.46062 + 360.98564737 * days + lon_lat[0])
-    hour, lat = sidereal - ascension, np.radians(lon_lat[1])
-    up = np.sin(lat) * np.sin(declination) + np.cos(lat) * np.cos(declination) * np.cos(hour)
-    east = -np.cos(declination) * np.sin(hour)
-    north = np.cos(lat) * np.sin(declination) - np.sin(lat) * np.cos(declination) * np.cos(hour)
-    return float(np.degrees(np.arcsin(up))), float(np.degrees(np.arctan2(east, north)) % 360.0)
 
 
 def _satellite(target: Array, axes: Array, incidence_deg: float, azimuth_deg: float) -> Array:

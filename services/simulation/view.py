@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from amers.services.errors import ComputationError
+from amers.services.geodesy import sun_direction
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage
 from amers.services.sensors.base import SensorModel
@@ -20,7 +21,7 @@ from amers.services.sensors.pushbroom import PushbroomModel
 from amers.services.sensors.rpc import RpcModel
 from amers.services.sensors.rpc_fit import fit_rpc
 from amers.services.simulation.light import radiance_of_day, smooth_radiance
-from amers.services.simulation.orbit import pushbroom_over, sun_direction
+from amers.services.simulation.orbit import pushbroom_over
 from amers.services.simulation.render import Radiometry, ray_setup, render, surface_seen
 from amers.services.simulation.world import World
 from amers.services.types import Acquisition, Array

@@ -8,13 +8,12 @@ from functools import cache
 import numpy as np
 
 from amers.services.adjustment.intersection import intersect
-from amers.services.geodesy import box_around, east_north_up, move_metres
+from amers.services.geodesy import box_around, east_north_up, move_metres, sun_direction
 from amers.services.imagery.scene import Scene
 from amers.services.matching.multi_image import refine_on_chips
 from amers.services.production.control_points import ControlBlock
 from amers.services.production.image_production import Production, produce_points
 from amers.services.sensors.base import SensorModel
-from amers.services.simulation.orbit import sun_direction
 from amers.services.simulation.render import Radiometry
 from amers.services.simulation.view import SimulatedView, render_view, simulate_block
 from amers.services.types import Array, ControlPoints, Frame

@@ -114,6 +114,8 @@ def opened_tiles(
                 sensor=image.platform,
                 acquired_at=image.acquired,
                 image_id=image.id,
+                sun_elevation_deg=image.sun_deg[0],
+                sun_azimuth_deg=image.sun_deg[1],
             )
             scenes.append(replace(scene, acquisition=acquisition))
         if scenes:

@@ -31,6 +31,7 @@ from amers.services.formats.sensor_models.rpc_files import DeliveredModel, has_r
 from amers.services.formats.sensor_models.rpc_text import rpb_satellite
 from amers.services.formats.sensor_models.worldview_isd import parse_isd_acquisition
 from amers.services.formats.text_files import parse_xml, read_text
+from amers.services.geodesy import sun_direction
 from amers.services.imagery.scene import Scene, view_direction
 from amers.services.map_grid import MapGrid
 from amers.services.sensors.ortho import OrthoModel
@@ -100,9 +101,12 @@ Landsat 8 and 9: a Tier 1 scene has a radial root mean square error of at most 1
 Collections), hence 18.2 m CE90 for a circular normal law; the USGS states no figure for Tier 2.
 """
 
+_GRANULE = re.compile(r"^T\d{2}[A-Z]{3}_\d{8}T\d{6}_", re.IGNORECASE)
+"""File names of granules of Sentinel-2: tile, and the time when they were seen."""
+
 _SENSOR_IN_NAME = (
     (re.compile(r"(?:^|_)(S2[A-D])_", re.IGNORECASE), "{0}"),
-    (re.compile(r"^T\d{2}[A-Z]{3}_\d{8}T\d{6}_", re.IGNORECASE), "S2"),
+    (_GRANULE, "S2"),
     (re.compile(r"(?:^|_)(L[CO]0[89])_L1TP_(?:\d+_){4}T1(?:_|$)", re.IGNORECASE), "{0}"),
 )
 """Patterns of the file names of ortho-images, with the name of the sensor."""
@@ -210,7 +214,7 @@ def scene_name(path: FilePlace) -> str:
 
 
 def _ortho_scene(image: SceneImage, grid: MapGrid, sigma_m: float | None, mask: Path | None) -> Scene:
-    acquisition = _ortho_acquisition(image)
+    acquisition = _with_sun(_ortho_acquisition(image), grid, image.shape)
     if sigma_m is None:
         sigma_m = _ortho_sigma_m(image.path, acquisition.sensor)
     shift = shift_of_grid(image, grid)
@@ -407,6 +411,19 @@ def _ortho_acquisition(image: SceneImage) -> Acquisition:
         date = "-".join(digits.group(1, 2, 3))
         time = parse_imaging_time(date, ":".join(digits.group(4, 5, 6)))
     return Acquisition(name, sensor, time, incidence_deg=0.0, azimuth_deg=0.0)
+
+
+def _with_sun(acquisition: Acquisition, grid: MapGrid, shape: tuple[int, int]) -> Acquisition:
+    """The sun of a granule of Sentinel-2, whose name has the time when it was seen.
+
+    Names of other products have the time of their production.
+    """
+    time = acquisition.acquired_at
+    if time is None or not _GRANULE.search(acquisition.image_id):
+        return acquisition
+    middle = grid.lon_lat(np.array(shape)[None] / 2.0)[0]
+    elevation_deg, azimuth_deg = sun_direction(middle, time)
+    return replace(acquisition, sun_elevation_deg=elevation_deg, sun_azimuth_deg=azimuth_deg)
 
 
 def product_sigma_m(sensor: str) -> float | None:

@@ -12,8 +12,11 @@ import math
 import re
 from typing import Any
 
+import numpy as np
+
 from amers.services.errors import FormatError
-from amers.services.formats.stac.items import parse_item
+from amers.services.formats.stac.items import StacImage, parse_item
+from amers.services.geodesy import sun_direction
 from amers.services.imagery.archives import Archive, ArchiveImage
 
 _ORBIT = re.compile(r"_R(\d{3})_")
@@ -63,6 +66,7 @@ def archive_image(item: Any, archive: Archive, source: str) -> ArchiveImage:
         footprint=stated.footprint,
         cloud=_share(stated.cloud_percent),
         snow=_share(stated.snow_percent),
+        sun_deg=_sun_deg(stated),
         offset=archive.offset_of(baseline, properties),
         accuracy=archive.stated(baseline),
     )
@@ -108,6 +112,14 @@ def _text(properties: Any, *names: str) -> str:
         if isinstance(value, str | int) and not isinstance(value, bool) and str(value):
             return str(value)
     return ""
+
+
+def _sun_deg(stated: StacImage) -> tuple[float, float]:
+    """Elevation and azimuth of the sun: as stated, else of the time and the place."""
+    sun_deg = stated.sun_elevation_deg, stated.sun_azimuth_deg
+    if np.isfinite(sun_deg).all():
+        return sun_deg
+    return sun_direction(np.array(stated.footprint.centroid.coords[0]), stated.acquired)
 
 
 def _share(percent: float) -> float:

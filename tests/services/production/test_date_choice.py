@@ -24,6 +24,7 @@ def image(number: int, **more: object) -> ArchiveImage:
         "baseline": "05.10",
         "footprint": shapely.box(6.0, 43.0, 7.0, 44.0),
         "cloud": 0.0,
+        "sun_deg": (50.0, 160.0),
         "snow": 0.0,
         "offset": -1000.0,
         "accuracy": NEW,
