@@ -20,7 +20,7 @@ import shapely
 from rasterio.transform import Affine
 
 from amers.services.geodesy import metres_per_degree, sun_direction
-from amers.services.imagery.archives import COPERNICUS_DEM, SENTINEL_2, ArchiveImage
+from amers.services.imagery.archives import COPERNICUS_DEM, SENTINEL_2
 from amers.services.map_grid import lon_lat_of_xy, xy_of_lon_lat
 from amers.services.simulation.conditions import clouds_over
 from amers.services.simulation.grid import bilinear_values
@@ -41,6 +41,11 @@ REGION_M = 3_500.0
 ORBITS = {"22": 0, "65": 3}
 """Relative orbits and their first day."""
 DATES = 24
+LOCAL_M = 0.9
+"""Errors of details within a date, a coordinate, metres: what the two dates of Berlin have
+(`pytest -s tests/journeys/test_real_base.py`)."""
+_WAVES = 12
+_WAVELENGTHS_M = 2000.0, 6000.0
 _HAZE = 300.0
 _GAIN = 6000.0
 
@@ -55,6 +60,17 @@ class TrueDate:
     cloud: float
     snow: float
     error_m: Array
+    waves: Array = field(default_factory=lambda: np.empty((0, 2, 4)))
+
+    def error_at(self, lon_lat: Array) -> Array:
+        """The error (…, 2) at places (…, 2): that of the date, and what varies over the ground."""
+        metres = (lon_lat - np.array(CENTRE)) * np.array(metres_per_degree(CENTRE[1], 0.0))
+        error_m = np.broadcast_to(self.error_m, lon_lat.shape).copy()
+        for waves in self.waves:
+            for axis, (per_east, per_north, phase, amplitude_m) in enumerate(waves.tolist()):
+                angle = metres[..., 0] * per_east + metres[..., 1] * per_north + phase
+                error_m[..., axis] += amplitude_m * np.sin(angle)
+        return error_m
 
 
 @dataclass
@@ -76,9 +92,16 @@ class OpenArchive:
     geoid: Path
     items: list[dict[str, Any]] = field(default_factory=list)
 
-    def error_m(self, image: ArchiveImage) -> Array:
-        """The true error of an image."""
-        return self.dates[f"{image.acquired:%Y%m%d}"].error_m
+    def error_of(self, date: str) -> Array:
+        """The true error (2,) of a date, such as 2021-05-02, the mean over the region."""
+        return self.dates[date[:10].replace("-", "")].error_at(self.places).mean(axis=0)
+
+    @property
+    def places(self) -> Array:
+        """Longitudes and latitudes (n, 2) all over the region."""
+        west, south, east, north = self.region
+        lon, lat = np.meshgrid(np.linspace(west, east, 29), np.linspace(south, north, 13))
+        return np.column_stack([lon.ravel(), lat.ravel()])
 
 
 def make_archive(folder: Path, seed: int = 7, dates: int = DATES) -> OpenArchive:
@@ -96,7 +119,7 @@ def make_archive(folder: Path, seed: int = 7, dates: int = DATES) -> OpenArchive
         light = light_of(world, date, rng)
         for tile in TILES:
             archive.items.append(_write_granule(archive, tile, date, light, rng))
-    archive.items.append(_write_heights(archive))
+    archive.items.append(_write_heights(archive, rng.spawn(1)[0]))
     _write_geoid(archive.geoid)
     document = {"type": "FeatureCollection", "features": archive.items}
     (folder / "items.json").write_text(json.dumps(document))
@@ -117,8 +140,19 @@ def _dates(rng: np.random.Generator) -> list[TrueDate]:
         cloud = float(rng.uniform(0.3, 0.8)) if number % 3 == 1 else float(rng.uniform(0.0, 0.08))
         snow = 0.5 if moment.month == 1 else 0.0
         baseline = "05.10" if is_new else "02.14"
-        dates.append(TrueDate(moment, orbit, baseline, cloud, snow, error_m))
+        dates.append(TrueDate(moment, orbit, baseline, cloud, snow, error_m, _waves(rng.spawn(1)[0])))
     return dates
+
+
+def _waves(rng: np.random.Generator) -> Array:
+    """Waves (n, 2, 4) over the ground, of east and north: per metre east and north, phase, amplitude."""
+    shape = _WAVES, 2
+    per_metre = 2.0 * np.pi / rng.uniform(*_WAVELENGTHS_M, shape)
+    direction, phase = rng.uniform(0.0, 2.0 * np.pi, (2, *shape))
+    amplitude_m = np.full(shape, LOCAL_M * np.sqrt(2.0 / _WAVES))
+    return np.stack(
+        [per_metre * np.cos(direction), per_metre * np.sin(direction), phase, amplitude_m], axis=-1
+    )
 
 
 def light_of(world: World, date: TrueDate, rng: np.random.Generator) -> Any:
@@ -161,7 +195,7 @@ def _write_granule(
 ) -> dict[str, Any]:
     crs, transform = map_of(tile)
     lon_lat = lon_lat_of_pixels(tile)
-    seen = ortho_pixels(archive.world, light, lon_lat, date.error_m)
+    seen = ortho_pixels(archive.world, light, lon_lat, date.error_at(lon_lat))
     classes = np.full(seen.shape, 4, dtype=np.uint8)
     at = np.arange(SIZE_PX, dtype=np.float64)
     if (clouds := clouds_over(seen.shape, date.cloud, rng)) is not None:
@@ -238,7 +272,7 @@ def _item(name: str, tile: str, date: TrueDate, lon_lat: Array, *, is_cut: bool)
     }
 
 
-def _write_heights(archive: OpenArchive) -> dict[str, Any]:
+def _write_heights(archive: OpenArchive, rng: np.random.Generator) -> dict[str, Any]:
     """The terrain of the world above the geoid, every 30 m."""
     west, south, east, north = archive.region
     margin, step = 0.08, 1.0 / 3600.0
@@ -247,7 +281,6 @@ def _write_heights(archive: OpenArchive) -> dict[str, Any]:
     grid = np.stack(np.meshgrid(lon, lat), axis=-1)
     heights = archive.world.height_m(grid.reshape(-1, 2)).reshape(grid.shape[:2]) - GEOID_M
     stated = COPERNICUS_DEM.accuracy[0]
-    rng = np.random.default_rng(13)
     noise = cv2.resize(natural_noise(rng, 256, 1.0, 0.0), heights.shape[::-1])
     heights += rng.normal(0.0, stated.common_m) + stated.own_m * noise / noise.std()
     transform = Affine(step, 0.0, lon[0] - step / 2.0, 0.0, -step, lat[0] + step / 2.0)

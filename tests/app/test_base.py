@@ -118,7 +118,7 @@ def test_one_command_makes_a_base_from_a_catalogue_with_faults(archive, base) ->
 
 def frame_error_m(archive: OpenArchive, made: dict[str, Any]) -> np.ndarray:
     """East and north by which the base is off: what dates are off by in truth, beyond what is found."""
-    true_m = [archive.dates[date[:10].replace("-", "")].error_m for date in made["dates"]]
+    true_m = [archive.error_of(date) for date in made["dates"]]
     left_m = np.array(true_m) - np.array(made["date_errors_east_north_m"])
     assert np.ptp(left_m, axis=0).max() < a_tenth_of_a_pixel * GSD_M, "all dates are in one frame"
     return np.asarray(left_m.mean(axis=0))
