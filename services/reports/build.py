@@ -1,5 +1,7 @@
 """The report of a registration, made from the registration and the facts around it."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +18,7 @@ from amers.services.reports.figure_data import FigureData
 from amers.services.reports.reasons import count_reasons
 from amers.services.reports.report import (
     REPORT_FORMAT,
+    BlockUsed,
     Check,
     CorrectionRecord,
     OrderScore,
@@ -25,6 +28,7 @@ from amers.services.reports.report import (
     SceneRecord,
 )
 from amers.services.sensors.ortho import OrthoModel
+from amers.services.types import ControlPoints, Measures
 
 
 def build_report(
@@ -84,6 +88,32 @@ def build_report(
         marks=registration.marks,
         figure_data=figure_data,
     )
+
+
+def with_shares(
+    blocks: Sequence[BlockUsed], points: ControlPoints, measures: Measures
+) -> tuple[BlockUsed, ...]:
+    """The blocks of control points with how many points each gave to a registration, and how accurate.
+
+    Args:
+        blocks: in the order of the points' blocks.
+        points: of all blocks.
+        measures: of the registration.
+    """
+    shared = []
+    for number, block in enumerate(blocks):
+        ids = points.id[points.block == number]
+        active = np.isin(points.id, measures.point_id[measures.active]) & (points.block == number)
+        variance_m2 = points.covariance_m2[active][:, [0, 1], [0, 1]].mean(axis=1)
+        shared.append(
+            replace(
+                block,
+                visible=int(np.isin(measures.point_id, ids).sum()),
+                active=int(active.sum()),
+                sigma_m=float(np.sqrt(np.median(variance_m2))) if active.any() else math.nan,
+            )
+        )
+    return tuple(shared)
 
 
 def scene_record(scene: Scene, name: str) -> SceneRecord:

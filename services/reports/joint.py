@@ -233,7 +233,7 @@ def joint_report(
         scenes=scenes,
         left=gone,
         joined=tuple(one.name for k, one in enumerate(block.scenes) if k not in result.numbers),
-        blocks=reports[0].run.blocks,
+        blocks=tuple(BlockUsed(one.id, one.version) for one in reports[0].run.blocks),
         control_points=len(block.control),
         active_control_points=int(active.sum()),
         tie_points=len(np.unique(block.ties.point)),

@@ -6,6 +6,7 @@ marked `NOT_IN_JSON`. A reader needs no other source for words: criteria carry l
 calculation, reasons carry a label, the verdict has its explanation, and the correction its sentences.
 """
 
+import math
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Literal
@@ -41,10 +42,17 @@ class BlockUsed:
 
     Attributes:
         id, version: of the block.
+        visible, active: numbers of its points that the scene could show, and that the correction uses;
+            null where no registration counted them.
+        sigma_m: median standard deviation of a horizontal coordinate of the active ones, relative to the
+            frame of the block, metres.
     """
 
     id: str
     version: str
+    visible: int | None = None
+    active: int | None = None
+    sigma_m: float = math.nan
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,9 @@ export interface AdjustmentOptions {
 export interface BlockUsed {
   id: string;
   version: string;
+  visible: number | null;
+  active: number | null;
+  sigma_m: number | null;
 }
 
 export interface Candidate {

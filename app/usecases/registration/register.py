@@ -38,7 +38,7 @@ from amers.services.registration.on_marks import register_on_marks
 from amers.services.registration.on_points import Registration, register_scene
 from amers.services.registration.options import RegistrationOptions
 from amers.services.registration.scene_marks import NoChips, SceneMarks, with_marks
-from amers.services.reports.build import build_report, scene_record
+from amers.services.reports.build import build_report, scene_record, with_shares
 from amers.services.reports.document import report_document
 from amers.services.reports.figure_data import figure_data
 from amers.services.reports.report import Check, RefinedModelRecord, RegistrationReport
@@ -243,10 +243,11 @@ def write_registered(
         copy_image=copy_image,
         stated=_stated(registration),
     )
+    run = attempt.run_record()
     report = build_report(
         registration,
         scene_record(scene, scene_name(files.image)),
-        attempt.run_record(),
+        replace(run, blocks=with_shares(run.blocks, control.points, registration.measures)),
         RefinedModelRecord(refined.max_error_px, refined.note),
         figure_data(scene, control.points, control.chips, registration),
         checks=checks,

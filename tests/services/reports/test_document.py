@@ -7,8 +7,13 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator, ValidationError
 
+from amers.services.reports.build import with_shares
 from amers.services.reports.document import format_report, report_document, report_schema
+from amers.services.reports.html import format_html
 from amers.services.reports.reasons import count_reasons
+from amers.services.reports.registration_pages import REGISTRATION_PAGE
+from amers.services.reports.report import BlockUsed
+from tests.factories import control_points
 
 
 def refuse(constant):
@@ -163,3 +168,30 @@ def test_a_reader_needs_no_other_source_for_words(report):
 def test_what_only_the_figures_draw_is_not_part_of_the_document(report):
     assert "figure_data" not in parsed(report)
     assert "figure_data" not in report_schema()["properties"]
+
+
+def test_a_report_says_which_block_gave_which_points(material):
+    made = material()
+    measures = made.registration.measures
+    points = control_points(len(measures.point_id), np.random.default_rng(2))
+    coarse = np.arange(len(points)) % 3 == 0
+    covariance_m2 = np.where(coarse, 9.0, 0.04)[:, None, None] * np.eye(3)
+    points = replace(
+        points,
+        id=measures.point_id,
+        block=coarse.astype(np.int64),
+        covariance_m2=covariance_m2,
+        frames=points.frames * 2,
+    )
+    blocks = with_shares((BlockUsed("fine", "1"), BlockUsed("coarse", "2")), points, measures)
+    assert [(one.id, one.sigma_m) for one in blocks] == [
+        ("fine", pytest.approx(0.2)),
+        ("coarse", pytest.approx(3.0)),
+    ]
+    assert [one.visible for one in blocks] == [(~coarse).sum(), coarse.sum()]
+    assert sum(one.active for one in blocks) == measures.active.sum()
+    shown = made.report()
+    shown = replace(shown, run=replace(shown.run, blocks=blocks))
+    validate(parsed(shown))
+    page = format_html(REGISTRATION_PAGE, shown)
+    assert f"coarse, version 2 ({blocks[1].active} of {blocks[1].visible} points used, sigma 3.0" in page
