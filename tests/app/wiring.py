@@ -6,35 +6,29 @@ the notes is where the option goes, and as what.
 """
 
 import contextlib
-import dataclasses
-import inspect
 import json
 import re
-import sys
 import typing
 from collections.abc import Iterator, Mapping
 from datetime import datetime
 from enum import Enum
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
-from types import ModuleType
 from typing import Any
-from unittest.mock import MagicMock
 from uuid import UUID
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from amers.app.cli.commands import COMMANDS
 from amers.app.cli.main import app
 from amers.app.cli.on_demand import Group, Tree, _load
+from tests.app.recorders import Recorders
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "wiring.json"
 PACKAGE = "amers.app.cli."
 SERVICES = ("demo", "serve", "worker")
 """Commands that run services, which no recorder ends."""
-RECORDED = ("amers.app.", "amers.services.")
 AN_ID = "01234567-89ab-4cde-8f01-23456789abcd"
 TEXTS: Mapping[str, str] = {
     "--bbox": "17.01,43.02,17.03,43.04",
@@ -54,7 +48,11 @@ TEXTS: Mapping[str, str] = {
     "--columns": "lon=a,lat=b",
     "--control-columns": "lon=a,lat=b",
     "--gsd-m": "17,19",
-    "--sigma-axes": "east,north",
+    "--sigma-axes": "ecef",
+    "--control-sigma-axes": "ecef",
+    "--heights-m": "17,19",
+    "--cloud-limits": "17,19",
+    "--control-points": "17,19",
     "--pixels": "corner",
 }
 """Values of options whose text has a form."""
@@ -82,8 +80,6 @@ COMPANIONS: tuple[tuple[str, tuple[str, ...]], ...] = (
 """What an option needs beside it, by how its name begins; the first that fits."""
 _FILES = ("dem", "control_dem", "model")
 """Options whose files the command itself looks for."""
-_CONVERTED = ("parse_", "printable", "by_", "checked_", "named_", "box_of", "stated_", "file_place")
-"""How functions begin that only convert what is given: these are called."""
 _OBJECT = re.compile(r" at 0x[0-9a-f]+| id='\d+'|/\d{12,}|" + re.escape(gettempdir()) + r"/[\w.-]+")
 
 
@@ -107,87 +103,6 @@ def parameters(words: tuple[str, ...]) -> list[Any]:
     for word in words:
         entry = entry.commands[word] if isinstance(entry, Group) else entry[word]
     return [one for one in _load(words[-1], entry).params if one.name != "help"]
-
-
-class Anything(MagicMock):
-    """A result that is printed, compared and passed on like any."""
-
-    def __format__(self, _spec: str) -> str:
-        """Some text."""
-        return "anything"
-
-    def __lt__(self, _other: object) -> bool:
-        """Never."""
-        return False
-
-    __gt__ = __le__ = __ge__ = __lt__
-
-
-class Recorders:
-    """Stands in for all that the command line calls."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Replace the functions in all modules of the command line."""
-        self.notes: list[tuple[str, str]] = []
-        for name, module in list(sys.modules.items()):
-            if name.startswith(PACKAGE):
-                for own, value in list(vars(module).items()):
-                    stand_in = self._in_place_of(value)
-                    if stand_in is not None:
-                        monkeypatch.setattr(module, own, stand_in)
-
-    def _in_place_of(self, value: object) -> object | None:
-        """What stands in for a function, or for a module with functions; None for anything else."""
-        if isinstance(value, ModuleType):
-            return _RecordedModule(self, value) if _is_recorded(value.__name__) else None
-        of = getattr(value, "__module__", "") or ""
-        if inspect.isfunction(inspect.unwrap(value)) and _is_recorded(of):  # type: ignore[arg-type]
-            return None if value.__name__.startswith(_CONVERTED) else self.of(value)
-        return None
-
-    def of(self, function: Any) -> Any:
-        """A recorder in place of a function."""
-        name = function.__qualname__
-
-        def recorder(*arguments: Any, **named: Any) -> Any:
-            for place, value in [*enumerate(arguments), *named.items()]:
-                self.notes.extend(leaves(f"{name}({place})", value))
-            return Anything(name=f"{name}()")
-
-        return recorder
-
-
-class _RecordedModule:
-    """A module whose functions are recorded."""
-
-    def __init__(self, recorders: Recorders, module: ModuleType) -> None:
-        self._recorders, self._module = recorders, module
-
-    def __getattr__(self, name: str) -> Any:
-        value = getattr(self._module, name)
-        stand_in = self._recorders._in_place_of(value)
-        return value if stand_in is None else stand_in
-
-
-def _is_recorded(module: str) -> bool:
-    return module.startswith(RECORDED) and not module.startswith((PACKAGE, "amers.app.config"))
-
-
-def leaves(path: str, value: Any, depth: int = 0) -> Iterator[tuple[str, str]]:
-    """The values in a value, each with the path that leads to it."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type) and depth < 6:
-        for field in dataclasses.fields(value):
-            yield from leaves(f"{path}.{field.name}", getattr(value, field.name, None), depth + 1)
-    elif isinstance(value, dict) and depth < 6:
-        for key, one in value.items():
-            yield from leaves(f"{path}[{key}]", one, depth + 1)
-    elif isinstance(value, list | tuple) and depth < 6:
-        for number, one in enumerate(value):
-            yield from leaves(f"{path}[{number}]", one, depth + 1)
-    elif isinstance(value, np.ndarray):
-        yield path, str(value.tolist())
-    elif isinstance(value, str | int | float | Path | UUID | Enum | datetime | type(None)):
-        yield path, str(value)
 
 
 def value_of(parameter: Any, folder: Path) -> list[str]:
@@ -253,7 +168,7 @@ def _file(parameter: Any, folder: Path) -> Path:
 def run(words: list[str], folder: Path) -> list[tuple[str, str]]:
     """What a command hands on, without the names of temporary folders."""
     with pytest.MonkeyPatch.context() as monkeypatch:
-        recorders = Recorders(monkeypatch)
+        recorders = Recorders(monkeypatch, PACKAGE)
         with contextlib.suppress(Exception):
             result = CliRunner().invoke(app, words)
             recorders.notes.append(("exit status", str(result.exit_code)))

@@ -1,0 +1,38 @@
+"""Every input of a process, and every parameter of an endpoint, goes where it went, as the same value.
+
+`tests/golden/wiring_of_jobs.json` has where. After a change that is meant, write it anew (`python -m
+tests.app.wiring_of_jobs`) and read what differs.
+"""
+
+import json
+from collections.abc import Callable
+
+import pytest
+
+from tests.app.wiring_of_jobs import GOLDEN, Found, interfaces
+
+EXPECTED = json.loads(GOLDEN.read_text())
+INTERFACES = dict(interfaces())
+NOWHERE = 28
+"""Inputs, of 370, whose way is not seen so: their call ends before, or hands them to no function of
+another module. The number may not grow."""
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(("name", "find"), INTERFACES.items(), ids=list(INTERFACES))
+def test_inputs_arrive_where_they_did(name: str, find: Callable[[], Found]) -> None:
+    assert find() == EXPECTED[name]
+
+
+def test_all_interfaces_are_known() -> None:
+    assert list(EXPECTED) == list(INTERFACES)
+
+
+def test_nearly_all_inputs_are_seen_to_arrive() -> None:
+    nowhere = [
+        f"{name} {of}"
+        for name, inputs in EXPECTED.items()
+        for of, places in inputs.items()
+        if not [place for place in places if not place.startswith("ends with")]
+    ]
+    assert len(nowhere) <= NOWHERE, nowhere
