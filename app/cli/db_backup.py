@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from amers.app.cli.exit_status import FAILURE, REFUSED
 from amers.app.cli.output import AsJson, show_one
 from amers.app.cli.progress import shown_progress
 from amers.app.config import read_settings
@@ -16,9 +17,6 @@ from amers.app.usecases.backups.make import make_backup
 from amers.app.usecases.backups.manifest import Manifest, find_problems, read_manifest
 from amers.app.usecases.backups.restore import restore_backup
 from amers.app.usecases.installation import Installation
-
-EXIT_DAMAGED = 1
-EXIT_REFUSED = 2
 
 
 def backup(
@@ -37,7 +35,7 @@ def backup(
             + "; ".join(f"{item.key}: {item.reason}" for item in manifest.damaged),
             err=True,
         )
-        raise typer.Exit(EXIT_DAMAGED)
+        raise typer.Exit(FAILURE)
 
 
 def verify_backup(
@@ -50,7 +48,7 @@ def verify_backup(
         problems = find_problems(folder, manifest, progress)
     show_one({**_summary(folder, manifest), "problems": problems}, as_json=as_json)
     if problems:
-        raise typer.Exit(EXIT_REFUSED)
+        raise typer.Exit(REFUSED)
 
 
 def restore(

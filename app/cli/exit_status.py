@@ -3,8 +3,8 @@
 | status | meaning |
 |---|---|
 | 0 | success |
-| 1 | any other failure: a service does not answer, a process was killed, a bug |
-| 2 | the input or the installation cannot be used |
+| 1 | any other failure: no answer of a service, a killed process, damaged files of the store, a bug |
+| 2 | the input, a backup or the installation cannot be used |
 | 3 | the scene could not be registered, or its verdict is failed; the block misses its specification |
 | 4 | another program uses the port of the service |
 | 130 | interrupted |

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from amers.app.cli.deletion import giving_up_reserve
+from amers.app.cli.exit_status import FAILURE
 from amers.app.cli.output import AsJson, Row, as_size, print_json, show, show_one
 from amers.app.cli.progress import shown_progress
 from amers.app.cli.transaction import transaction
@@ -109,7 +110,7 @@ def verify(
             err=True,
         )
     if not outcome.is_whole:
-        raise typer.Exit(1)
+        raise typer.Exit(FAILURE)
 
 
 def _finding(finding: Finding) -> Row:

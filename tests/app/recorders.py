@@ -65,13 +65,13 @@ class Recorders:
         notes: the values that they were called with, each after the path that leads to it.
     """
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, package: str) -> None:
-        """Replace the functions of other packages in all modules of a package, or in one module."""
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, package: str, but: tuple[str, ...] = ()) -> None:
+        """Replace the functions of other packages in the modules of a package, but some, or in one."""
         self.notes: list[tuple[str, str]] = []
         self._package = package
         Anything.notes = self.notes
         for name, module in list(sys.modules.items()):
-            if name.startswith(package):
+            if name.startswith(package) and name not in but:
                 for own, value in list(vars(module).items()):
                     stand_in = self._in_place_of(value)
                     if stand_in is not None:
