@@ -160,6 +160,6 @@ def test_what_is_found_decides_how_a_command_ends(
         word for one in parameters(tuple(words)) if one.required for word in value_of(one, tmp_path)
     ]
     Recorders(monkeypatch, PACKAGE, (f"{PACKAGE}failures", f"{PACKAGE}exit_status"))
-    monkeypatch.setattr(f"{PACKAGE}{function}", lambda *_arguments: result)
+    monkeypatch.setattr(f"{PACKAGE}{function}", lambda *_arguments, **_named: result)
     more = ["--points-per-km2", "1"] if command == "block quality" else []
     assert (app([*words, *given, *more], prog_name="amers", standalone_mode=False) or 0) == status
