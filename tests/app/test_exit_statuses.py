@@ -161,5 +161,6 @@ def test_what_is_found_decides_how_a_command_ends(
     ]
     Recorders(monkeypatch, PACKAGE, (f"{PACKAGE}failures", f"{PACKAGE}exit_status"))
     monkeypatch.setattr(f"{PACKAGE}{function}", lambda *_arguments, **_named: result)
+    monkeypatch.setattr(f"{PACKAGE}block_quality._show_report", lambda *_arguments, **_named: None)
     more = ["--points-per-km2", "1"] if command == "block quality" else []
     assert (app([*words, *given, *more], prog_name="amers", standalone_mode=False) or 0) == status
