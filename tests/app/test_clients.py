@@ -252,7 +252,10 @@ def test_the_page_connect_has_the_address_of_the_service(served):
     reply = httpx.get(f"{served.url}/connect", headers={"Accept": "text/html"})
     assert reply.status_code == 200
     assert reply.headers["content-type"].startswith("text/html")
-    assert "default-src 'none'" in reply.headers["content-security-policy"]
+    assert reply.headers["content-security-policy"] == (
+        "default-src 'none'; style-src 'unsafe-inline'; img-src 'self' data:; form-action 'self'; "
+        "frame-ancestors 'none'"
+    )
     assert "BASE" not in reply.text
     assert f"ogrinfo -so OAPIF:{served.url} points" in reply.text
     for recipe in RECIPES:

@@ -120,7 +120,9 @@ def test_a_scene_goes_from_upload_to_a_refined_model_by_http(
         assert bearer("register").get(link["href"]).status_code == 404
     assert_registered(folder, world)
     page = me.get(results["report.html"]["href"])
-    assert "default-src 'none'" in page.headers["content-security-policy"]
+    assert page.headers["content-security-policy"] == (
+        "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
+    )
     for name in ("..%2Freport.json", "nothing.json", "%2e%2e"):
         assert me.get(f"/jobs/{ended_job['jobID']}/results/{name}").status_code == 404
     assert me.get(f"/scenes/{scene}").json()["footprint"]["type"] == "Polygon"

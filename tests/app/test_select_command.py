@@ -82,6 +82,9 @@ def test_a_selection_is_written_with_cells_tables_and_report(select, catalogue, 
         assert stated < item["properties"]["amers:cloud_limit_percent"]
     cells = pyogrio.raw.read(out / "cells.gpkg")
     fields = dict(zip(cells[0]["fields"], cells[3], strict=True))
+    outlines = shapely.union_all(shapely.from_wkb(cells[2]))
+    assert outlines.bounds == pytest.approx(AREA.bounds, abs=0.3)
+    assert outlines.intersection(AREA).area > 0.97 * AREA.area
     assert len(fields["clear_views"]) == report["cells"]
     missing = np.maximum(0, 6 - fields["clear_views"])
     assert (missing == fields["missing_views"]).all()

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor, wait
+from datetime import UTC, datetime, timedelta
 from uuid import uuid4
 
 import pytest
@@ -264,6 +265,8 @@ def test_the_command_line_makes_lists_and_revokes(dsn):
     record = json.loads(made.stdout)
     with engine.connect(dsn) as connection:
         assert authenticate(connection, record["secret"]).name == "survey office"
+    left = datetime.fromisoformat(record["expires_at"]) - datetime.now(UTC)
+    assert timedelta(days=6, hours=23) < left <= timedelta(days=7)
 
     listed = json.loads(amers(dsn, "token", "list", "--json").stdout)
     assert [token["id"] for token in listed] == [record["id"]]

@@ -224,4 +224,7 @@ def test_req_html_definition_and_content(get, path):
         assert reply.headers["content-type"].startswith("text/html")
         assert "<h1>" in reply.text
         assert "<script" not in reply.text
-        assert "default-src 'none'" in reply.headers["content-security-policy"]
+        assert reply.headers["content-security-policy"] == (
+            "default-src 'none'; style-src 'unsafe-inline'; img-src 'self' data:; form-action 'self'; "
+            "frame-ancestors 'none'"
+        )

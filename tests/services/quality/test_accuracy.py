@@ -111,9 +111,24 @@ def test_an_honest_precision_has_normalised_errors_near_one():
     error = rng.multivariate_normal(np.zeros(2), covariance, 500)
     honest = normalised_error(error, np.broadcast_to(covariance, (500, 2, 2)))
     flattering = normalised_error(error, np.broadcast_to(covariance / 4.0, (500, 2, 2)))
+    modest = normalised_error(error, np.broadcast_to(covariance * 2.0, (500, 2, 2)))
     assert honest.lower < honest.mean_square < honest.upper
     assert flattering.mean_square == pytest.approx(4.0 * honest.mean_square)
     assert flattering.mean_square > flattering.upper
+    assert modest.mean_square < modest.lower
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "lower", "upper"),
+    [(1, 1, 0.000982, 5.024), (5, 2, 3.247, 20.483), (10, 3, 16.791, 46.979), (50, 1, 32.357, 71.420)],
+)
+def test_an_honest_mean_square_lies_within_tabulated_chi_squares(rows, columns, lower, upper):
+    """Quantiles 0.025 and 0.975 of chi-square, as printed in tables."""
+    stated = normalised_error(np.ones((rows, columns)), np.tile(np.eye(columns), (rows, 1, 1)))
+    freedom = rows * columns
+    assert stated.lower * freedom == pytest.approx(lower, rel=5e-4)
+    assert stated.upper * freedom == pytest.approx(upper, rel=5e-4)
+    assert (stated.n, stated.mean_square) == (rows, 1.0)
 
 
 def test_normalised_errors_leave_out_missing_values():

@@ -8,7 +8,7 @@ import pytest
 from amers.services.conventions import CHIP_CENTRE
 from amers.services.errors import CoverageError, OtherGround
 from amers.services.geodesy import move_metres
-from amers.services.imagery.scene import Scene
+from amers.services.imagery.scene import Scene, scene_gsd_m
 from amers.services.imagery.source import ArrayImage
 from amers.services.matching.chip_extent import MIN_VISIBLE_SIDE
 from amers.services.registration.chip_selection import visibility_probability
@@ -100,10 +100,21 @@ def test_of_two_points_at_one_place_the_better_one_is_tried(worse: str) -> None:
 
 
 def test_points_are_visible_as_far_as_the_scene_may_be_off() -> None:
+    """Three standard deviations of the model around the image, on each side, and no farther."""
     scene, points = small_scene(), block()[0]
-    visible = visible_points(scene, points)
-    sure = visible_points(replace(scene, sigma_m=0.0), points)
-    assert set(sure.tolist()) < set(visible.tolist())
+    points = points.take(np.zeros(8, dtype=np.int64))
+    margin_px = 3.0 * scene.sigma_m / scene_gsd_m(scene)
+    middle, beyond = SIZE_PX / 2.0, SIZE_PX + margin_px
+    places = np.array(
+        [
+            [side, middle] if is_line else [middle, side]
+            for is_line in (True, False)
+            for side in (2.0 - margin_px, -2.0 - margin_px, beyond - 2.0, beyond + 2.0)
+        ]
+    )
+    ground = scene.model.locate(places, points.lon_lat_h[:, 2])
+    visible = visible_points(scene, replace(points, lon_lat_h=ground))
+    assert visible.tolist() == [0, 2, 4, 6]
 
 
 def test_a_scene_beside_all_points_is_refused() -> None:
