@@ -81,7 +81,7 @@ release: postgis page
 # Small faults, one at a time: MODULE=services/quality takes minutes, without a module all take hours.
 # What was broken off goes on; SAMPLE=200 tries more of each module.
 mutants: postgis
-	$(BIN)/python -m mutants $(MODULE) $(if $(SAMPLE),--sample $(SAMPLE))
+	$(BIN)/python -m mutants $(MODULE) $(if $(SAMPLE),--sample $(SAMPLE)) $(if $(SINCE),--since $(SINCE))
 
 pictures: page chromium
 	$(BIN)/python scripts/make_pictures.py demo-output

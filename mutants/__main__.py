@@ -1,13 +1,17 @@
 """`python -m mutants [MODULE ...]`: try mutants of the modules, and print the table and the survivors.
 
-What was tried is kept in `.mutants/trials.jsonl`: a run that was broken off goes on, and a mutant is
-tried again when its file has changed, or when it survived and tests have changed.
+Which mutants are drawn follows from the commit: those of another commit are fresh, and no test was
+written for them. What was tried is kept in `.mutants/trials.jsonl`: a run that was broken off goes on,
+and a mutant is tried again when its file has changed, or when it survived and tests have changed.
 """
 
 import argparse
 import json
+import re
+import subprocess
 import time
 from collections.abc import Sequence
+from hashlib import blake2b
 from pathlib import Path
 
 from mutants.changes import Mutant, mutants_of
@@ -34,16 +38,54 @@ def main() -> None:
         default=60.0,
         help="of tests for each mutant, the fastest first (default: 60)",
     )
+    parser.add_argument(
+        "--draw", default=_commit(), help="any text, which decides what is drawn (default: the commit)"
+    )
+    parser.add_argument(
+        "--since", metavar="COMMIT", help="only mutants of lines that were changed since a commit"
+    )
     options = parser.parse_args()
+    changed = None if options.since is None else _changed_lines(options.since)
+    print(f"drawn by {options.draw}", flush=True)
     trials: dict[str, Sequence[Trial]] = {}
     totals: dict[str, int] = {}
     for module in chosen_modules(options.module):
         with copied_project(ROOT) as copy:
             mutants = [one for path in module.mutated_files(copy) for one in mutants_of(copy, path)]
-            chosen = sorted(mutants, key=lambda one: one.key)[: options.sample]
+            mutants = [one for one in mutants if changed is None or _is_among(one, changed)]
+            chosen = sorted(mutants, key=lambda one: _place(one, options.draw))[: options.sample]
             totals[module.name] = len(mutants)
             trials[module.name] = _tried(copy, module, chosen, options.seconds)
         print(table(trials, totals), survivors(trials[module.name]), sep="\n\n", flush=True)
+
+
+def _place(mutant: Mutant, draw: str) -> str:
+    """Where a mutant stands in a draw."""
+    return blake2b(f"{draw}\0{mutant.key}".encode(), digest_size=8).hexdigest()
+
+
+def _commit() -> str:
+    return _git("rev-parse", "--short=8", "HEAD").strip()
+
+
+def _changed_lines(since: str) -> set[tuple[str, int]]:
+    """Files and lines of the working tree that a commit did not have."""
+    lines, path = set(), ""
+    for text in _git("diff", "--unified=0", since).splitlines():
+        if text.startswith("+++ "):
+            path = text.removeprefix("+++ b/")
+        elif place := re.match(r"@@ .* \+(\d+)(?:,(\d+))? @@", text):
+            first, count = int(place[1]), int(place[2] or 1)
+            lines |= {(path, line) for line in range(first, first + count)}
+    return lines
+
+
+def _is_among(mutant: Mutant, lines: set[tuple[str, int]]) -> bool:
+    return any((mutant.path, line) in lines for line in range(mutant.lines[0], mutant.lines[1] + 1))
+
+
+def _git(*words: str) -> str:
+    return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout
 
 
 def _tried(copy: Path, module: Module, mutants: Sequence[Mutant], limit_s: float) -> list[Trial]:

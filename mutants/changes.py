@@ -1,10 +1,11 @@
 """The mutants of a file: its text with one small change.
 
 The changes are those of mutmut, without what a type error shows at once (a value that becomes None, a
-missing argument) and without messages for people, and one more: a term, a factor or a condition is
-dropped.
+missing argument) and without messages for people, and two more: a term, a factor or a condition is
+dropped, and the values of two arguments are exchanged.
 """
 
+import itertools
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -105,6 +106,8 @@ def _changeable(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
 
 def _changes(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
     yield from _operand_alone(node)
+    if isinstance(node, cst.Call):
+        yield from _exchanged(node)
     for kind, operator in mutation_operators:
         if operator is operator_arg_removal:
             if isinstance(node, cst.Call):
@@ -124,6 +127,14 @@ def _without_an_argument(call: cst.Call) -> Iterator[cst.CSTNode]:
     for number, argument in enumerate(call.args):
         if argument.keyword is not None or (of_any_number and len(call.args) > 1):
             yield call.with_changes(args=[*call.args[:number], *call.args[number + 1 :]])
+
+
+def _exchanged(call: cst.Call) -> Iterator[cst.CSTNode]:
+    """A call with the values of two neighbouring arguments exchanged."""
+    for number, (one, other) in enumerate(itertools.pairwise(call.args)):
+        if one.star == other.star == "":
+            pair = [one.with_changes(value=other.value), other.with_changes(value=one.value)]
+            yield call.with_changes(args=[*call.args[:number], *pair, *call.args[number + 2 :]])
 
 
 def _operand_alone(node: cst.CSTNode) -> Iterator[cst.CSTNode]:

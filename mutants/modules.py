@@ -90,6 +90,11 @@ MODULES = (
         "sweep retention job_leases storage_identity storage",
     ),
     _of_service("config", "config.py", "config"),
+    _of_service(
+        "cli",
+        "cli",
+        "wiring exit_statuses command_output options select_command production_plan register_command",
+    ),
 )
 
 
