@@ -181,12 +181,22 @@ def read_scene(
         *accuracy,
     )
     if rigorous is None:
+        statements += _through_rpc(delivered)
         return Scene(source, delivered.model, acquisition, sigma_m, statements=statements)
     model = rigorous.model
     if delivered.convention != "rigorous":
         model = replace(model, height_range_m=delivered.model.height_range_m)
     used = Statement(rigorous.path.name, Subject.MODEL, Use.USED, "rigorous sensor model")
     return Scene(source, model, acquisition, sigma_m, parameter_set, (used, *statements))
+
+
+def _through_rpc(delivered: DeliveredModel) -> Statements:
+    """What is not adjusted of a rigorous model that is read as an RPC; nothing of other models."""
+    if delivered.convention != "rigorous":
+        return ()
+    note = "the RPC fitted to them is used; amers scene register-many --rigorous srp adjusts them"
+    value = "parameters of orbit and attitude"
+    return (Statement(delivered.path.name, Subject.MODEL, Use.NOT_USED, value, note=note),)
 
 
 def scene_name(path: FilePlace) -> str:

@@ -24,6 +24,11 @@ READER = Reader(
             "used",
             "Where there is no RPC an RPC is fitted to it; with --rigorous itself.",
         ),
+        Treatment(
+            Subject.MODEL,
+            "named",
+            "Orbit and attitude, where the RPC is: scene register-many --rigorous adjusts them.",
+        ),
         Treatment(Subject.MODEL, "refused", "A value that is missing, impossible or not supported."),
         Treatment(
             Subject.IDENTITY, "used", "The name of the product, where all images are called IMAGERY."
