@@ -148,7 +148,7 @@ def _write_map(ground: Ground, name: str, values: Array, first: int) -> None:
 
 
 def _write_drawings(ground: Ground) -> None:
-    """Write marks of check points, a road on the raw scene, a map with a field, and a lake."""
+    """Write marks held out and used, a road on the raw scene, a map with a field, and a lake."""
     truth = true_model(ground.world, "east")
     marks = []
     for line in range(100, SIZE, 140):
@@ -163,6 +163,11 @@ def _write_drawings(ground: Ground) -> None:
                 }
             )
     _write_json(ground.folder / "marks.geojson", {"type": "FeatureCollection", "features": marks})
+    places = [(*one["geometry"]["coordinates"], *list(one["properties"].values())[:2]) for one in marks]
+    (ground.folder / "marks.csv").write_text(
+        "# pixel-origin=centre heights=ellipsoid\nid,lon,lat,height_m,line,sample\n"
+        + "".join(f"M{k},{','.join(map(str, place))}\n" for k, place in enumerate(places[::4], 1))
+    )
     road = shapely.LineString([(200.0, -200.0), (300.0, -420.0), (620.0, -640.0)])
     write_layer(
         ground.folder / "roads.gpkg", VectorLayer("roads", np.array([road]), _names("D 7"), None)
