@@ -33,6 +33,9 @@ a_third_of_a_pixel = 1.0 / 3.0
 half_a_pixel = 0.5
 a_blunder_px = 40
 a_hundredth_px = 0.01
+long_step_px = 12
+most_keys_of_the_first = 40
+most_keys_of_others = 5
 EXPECTED = re.compile(r"expected in the circle of (\d+) px, at line (-?\d+\.\d), sample (-?\d+\.\d)")
 
 
@@ -86,6 +89,20 @@ def choose_with_keys(page: Page, line_sample: Array) -> None:
         for _ in range(abs(steps)):
             page.keyboard.press(f"Shift+{on if steps > 0 else back}")
     page.keyboard.press("Enter")
+
+
+def keys_to(page: Page, line_sample: Array) -> int:
+    """Move the crosshair by long and by short steps to a place and set it; returns the keys pressed."""
+    pressed = 1
+    off = np.round(off_expected(page, page.get_by_role("application"), line_sample)).astype(int)
+    for distance, ways in zip(off.tolist(), (("Up", "Down"), ("Left", "Right")), strict=True):
+        long, short = divmod(abs(distance), long_step_px)
+        for prefix, count in (("", long), ("Shift+", short)):
+            for _ in range(count):
+                page.keyboard.press(f"{prefix}Arrow{ways[distance > 0]}")
+        pressed += long + short
+    page.keyboard.press("Enter")
+    return pressed
 
 
 def rows(page: Page) -> Locator:
@@ -285,6 +302,30 @@ def test_marks_on_a_reference_image_take_heights_of_its_terrain(
     page.get_by_label("Reference image on the map").select_option("none")
     until_drawn(page)
     page.screenshot(path=ARTEFACTS / "marks-without-reference.png")
+
+
+def test_ten_marks_take_few_keys_each_without_a_pointer(visit, world, secret, service):
+    """Ground positions are pasted; what else a mark needs is counted."""
+    page = visit(f"#/mark/{uploaded(service, secret, world)}", secret, WIDE)
+    image = opened(page)
+    keys = []
+    for number, place in enumerate(PICKED, 1):
+        ground, pressed = page.get_by_label("Place on the ground"), 1
+        while not ground.evaluate("field => field === document.activeElement"):
+            page.keyboard.press("Shift+Tab" if number > 1 else "Tab")
+            pressed += 1
+        page.keyboard.insert_text(ground_text(world, place))
+        page.keyboard.press("Enter")
+        expect(image).to_be_focused()
+        pressed += 1 + keys_to(page, place)
+        keys.append(pressed)
+        expect(rows(page)).to_have_count(number)
+        until_adjusted(page)
+    print(f"keys of each mark: {keys}")
+    expect(rows(page).get_by_text("used", exact=True)).to_have_count(len(PICKED))
+    assert np.abs(residuals_shown(page)).max() < a_pixel
+    assert keys[0] <= most_keys_of_the_first  # the model is 17 px off
+    assert max(keys[1:]) <= most_keys_of_others
 
 
 @pytest.mark.real_data

@@ -97,6 +97,8 @@ class Marking {
   private readonly save = h("button", { type: "button", onclick: () => this.download() }, "Save as CSV");
   private readonly file = h("input", { type: "file", id: "open-marks", accept: ".csv", onchange: () => void this.openFile() });
   private readonly send = h("button", { type: "button", class: "strong", onclick: () => void this.register() }, "Register with these marks");
+  /** Whether the last place on the ground was typed: the next one is, too, so its field gets the focus. */
+  private isTyped = false;
   private readonly onward = h("button", { type: "button", onclick: () => this.goOn() }, "Go to where the next mark helps most");
   private readonly summary = h("div", { class: "summary", role: "status" });
   private readonly notes = h("div");
@@ -175,7 +177,7 @@ class Marking {
   }
 
   private shortcut(event: KeyboardEvent): void {
-    if (!(event.ctrlKey || event.metaKey) || event.target instanceof HTMLInputElement) return;
+    if (!(event.ctrlKey || event.metaKey) || (event.target instanceof HTMLInputElement && event.target.value)) return;
     const key = event.key.toLowerCase();
     if (key === "z" && !event.shiftKey) this.back();
     else if (key === "y" || key === "z") this.forth();
@@ -211,6 +213,7 @@ class Marking {
 
   /** The place on the map, or the control point there with its height and sigmas. */
   private async chooseOnMap([lon, lat]: Position, point?: number): Promise<void> {
+    this.isTyped = false;
     try {
       this.choose({ ground: point === undefined ? { lon: lon!, lat: lat!, height_m: null, sigma_m: null } : await pointOnGround(point, this.place.signal) });
     } catch (error) {
@@ -226,6 +229,7 @@ class Marking {
     const marks = this.completed(begun);
     if (marks !== this.marks) {
       this.put({ marks, begun: nothingBegun(marks) }, `${marks.at(-1)!.name} set.`);
+      if (this.isTyped) this.ground.focus();
       return;
     }
     this.put({ marks: this.marks, begun }, half.image ? "Place in the image chosen." : half.ground?.point === undefined ? "Place on the ground chosen." : `Control point ${half.ground.point} chosen.`);
@@ -260,6 +264,7 @@ class Marking {
       if (this.image.value.trim() && this.image.value !== imageText(image)) half.image = this.shown(parseInImage(this.image.value));
       if (this.ground.value.trim() && this.ground.value !== groundText(ground)) half.ground = this.inside(parseOnGround(this.ground.value));
       if (!half.image && !half.ground && this.completed() === this.marks) throw new Error(image && ground ? "A height is missing: add it after longitude and latitude." : "A place in the image or on the ground is missing.");
+      this.isTyped ||= half.ground !== undefined;
       this.choose(half);
       if (half.ground) void this.place.atlas.goTo([half.ground.lon, half.ground.lat]);
     } catch (error) {
