@@ -19,17 +19,30 @@ BUDGETS = {
     "--version": {"importlib.metadata"},
     "--help": frozenset(),
     "block --help": {"importlib.metadata"},
-    "serve --help": CONNECTION,
-    "token list --help": STORE,
-    "audit --help": STORE,
-    "block list --help": LISTING,
-    "block publish --help": STORE,
+    # The help of a command is read from a file: see `tests/app/test_recorded_help.py`.
+    "scene register --help": {"importlib.metadata"},
+}
+MODULES = {
+    "serve": CONNECTION,
+    "token": STORE,
+    "audit": STORE,
+    "block_listing": LISTING,
+    "block_detail": LISTING,
+    "block_state": STORE,
     # The jobs are done by other processes, which a warm server of the worker forks. Products may lie in
     # buckets: obstore takes 4 ms.
-    "worker --help": STORE | {"obstore", "procrastinate"},
+    "worker": STORE | {"obstore", "procrastinate"},
     # Without the statistics of scipy: a third of the time that its start takes.
-    "scene register --help": PACKAGES - {"scipy.stats", "fastapi", "matplotlib", "pandas", "uvicorn"},
+    "scene": PACKAGES - {"scipy.stats", "fastapi", "matplotlib", "pandas", "uvicorn"},
 }
+"""By the module of a command: what it imports before it works."""
+
+
+@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.long
+def test_the_module_of_a_command_imports_no_more_than_its_budget(name):
+    beyond = beyond_budget(imported_by(f"import amers.app.cli.{name}"), MODULES[name])
+    assert beyond == {}, f"amers.app.cli.{name} imports what it does not need; see who asks for it first"
 
 
 @pytest.mark.parametrize("words", BUDGETS)

@@ -1,6 +1,6 @@
 """`amers block list`, and what the commands on blocks of the store print alike."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -38,4 +38,25 @@ def block_row(block: BlockSummary) -> Row:
         "title": block.title,
         "created_at": block.created_at,
         "state_changed_at": block.state_changed_at,
+    }
+
+
+def renewal_row(document: dict[str, Any]) -> Row:
+    """What a renewed version of a block has of new and leaves out, by its names."""
+    scenes = "; ".join(
+        f"{one['image']}: {one['points_with_new_views']} points of {one['points_seen']} seen"
+        for one in document["scenes"]
+    )
+    withdrawals = [
+        f"point {one['point']}, missed by {one['scenes_that_missed_it']} scenes, "
+        f"last found {one['last_found'] or 'never'}, "
+        f"p = {one['probability_if_still_there']:g} if still there"
+        for one in document["proposed_withdrawals"]
+    ]
+    return {
+        "renews": document["renews"],
+        "scenes": scenes,
+        "new views": document["new_views"],
+        "new points": f"{document['new_points']}: {document['new_points_note']}",
+        "proposed withdrawals": "; ".join([str(len(withdrawals)), *withdrawals]),
     }

@@ -3,12 +3,13 @@
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import Annotated
 from uuid import UUID
 
 import typer
 
-from amers.app.cli.output import AsJson, Row, print_json, show_one
+from amers.app.cli.block_listing import renewal_row
+from amers.app.cli.output import AsJson, print_json, show_one
 from amers.app.cli.progress import shown_progress
 from amers.app.cli.transaction import transaction
 from amers.app.config import read_settings
@@ -69,24 +70,3 @@ def renew(
         print_json({**staged, "points": block.n_points, "renewal": document})
         return
     show_one({**staged, "points": block.n_points, **renewal_row(document)}, as_json=False)
-
-
-def renewal_row(document: dict[str, Any]) -> Row:
-    """What a renewed version of a block has of new and leaves out, by its names."""
-    scenes = "; ".join(
-        f"{one['image']}: {one['points_with_new_views']} points of {one['points_seen']} seen"
-        for one in document["scenes"]
-    )
-    withdrawals = [
-        f"point {one['point']}, missed by {one['scenes_that_missed_it']} scenes, "
-        f"last found {one['last_found'] or 'never'}, "
-        f"p = {one['probability_if_still_there']:g} if still there"
-        for one in document["proposed_withdrawals"]
-    ]
-    return {
-        "renews": document["renews"],
-        "scenes": scenes,
-        "new views": document["new_views"],
-        "new points": f"{document['new_points']}: {document['new_points_note']}",
-        "proposed withdrawals": "; ".join([str(len(withdrawals)), *withdrawals]),
-    }

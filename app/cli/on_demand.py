@@ -1,7 +1,7 @@
 """Groups of commands that are imported on first use: help and errors need none of their modules."""
 
 from collections import UserDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, TypeAlias
@@ -12,6 +12,7 @@ from typer.main import get_command
 
 from amers.app.cli.arguments import CheckedCommand
 from amers.app.cli.options import with_options
+from amers.app.cli.recorded import recorded
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,9 @@ class GroupOnDemand(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The command to run, and the rest of the arguments."""
         name, _, rest = super().resolve_command(ctx, args)
+        entry = self._tree[str(name)]
+        if isinstance(entry, Command) and "--help" in rest:
+            return name, _as_command(str(name), recorded(entry.function)), rest
         return name, self.commands[str(name)], rest
 
 
@@ -84,7 +88,10 @@ def _load(name: str, entry: Command | Group) -> Any:
     if isinstance(entry, Group):
         return GroupOnDemand(entry.commands, name=name, help=entry.help, no_args_is_help=True)
     module, _, function = entry.function.partition(":")
-    command = with_options(getattr(import_module(f"amers.app.cli.{module}"), function))
+    return _as_command(name, with_options(getattr(import_module(f"amers.app.cli.{module}"), function)))
+
+
+def _as_command(name: str, function: Callable[..., None]) -> Any:
     one = typer.Typer(add_completion=False)
-    one.command(name, cls=CheckedCommand)(command)
+    one.command(name, cls=CheckedCommand)(function)
     return get_command(one)

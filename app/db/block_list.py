@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from datetime import datetime
+from typing import Any
 
 from psycopg.rows import dict_row
 
@@ -45,12 +46,16 @@ class ListedBlock:
         sigma_horizontal_m, sigma_up_m: standard deviations of its median point, a coordinate, in its
             frame.
         frame: on the Earth.
+        box: west, south, east, north of its outline, degrees; in one piece across the antimeridian.
+        renewal: what its document says of its renewal; None for a block that renews none.
     """
 
     block: BlockSummary
     sigma_horizontal_m: float
     sigma_up_m: float
     frame: Frame
+    box: tuple[float, float, float, float]
+    renewal: dict[str, Any] | None
 
 
 def list_blocks(connection: DriverConnection) -> list[ListedBlock]:
@@ -61,6 +66,8 @@ def list_blocks(connection: DriverConnection) -> list[ListedBlock]:
             sigma_horizontal_m=row.pop("sigma_horizontal_m"),
             sigma_up_m=row.pop("sigma_up_m"),
             frame=parse_frame(row.pop("frame"), row.pop("frame_sigma_m")),
+            box=row.pop("box"),
+            renewal=row.pop("renewal"),
             block=BlockSummary(**row),
         )
         for row in cursor.execute(sql_file("block_list.sql").encode())

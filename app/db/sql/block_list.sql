@@ -7,5 +7,7 @@ select number, id, version, title, state, priority, n_points, n_unserved, n_view
     metadata -> 'amers:frame' as frame,
     cast(jsonb_path_query_first(
         metadata, '$."amers:accuracy"."absolute"[*] ? (@.name == "frame_sigma_m").value'
-    ) as double precision) as frame_sigma_m
+    ) as double precision) as frame_sigma_m,
+    array[st_xmin(extent), st_ymin(extent), st_xmax(extent), st_ymax(extent)] as box,
+    metadata #> '{amers:provenance,options,renewal}' as renewal
 from block order by number desc

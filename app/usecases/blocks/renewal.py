@@ -202,13 +202,6 @@ def stage_renewal(
     return lifecycle.ingest_block(connection, storage, folder, progress, present[0].priority)
 
 
-def find_renewal(connection: Connection, block: Block) -> dict[str, Any] | None:
-    """What the document of a block says of its renewal; None for a block that renews none."""
-    document = parse_block_json(blocks.find_document(connection, block.number))
-    renewed: dict[str, Any] | None = document.metadata.provenance.options.get(RENEWAL)
-    return renewed
-
-
 def _all_searches(stored: Searches, seen: Sequence[SceneOnBlock]) -> Searches:
     """The searches of the store, and those of all points by the scenes of the renewal."""
     first = len(stored.days)
