@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from amers.services.imagery.scene import Scene
-from amers.services.imagery.source import reduce_image, render_chip
+from amers.services.imagery.source import quick_view, render_chip
 from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.registration.on_points import Registration
 from amers.services.sensors.displacement import DisplacementGrid
@@ -144,7 +144,7 @@ def displacement_sections(adjustment: SceneAdjustment) -> tuple[Section, ...]:
 
 def _quicklook(scene: Scene) -> Quicklook:
     factor = max(1, math.ceil(max(scene.image.shape) / QUICKLOOK_PX))
-    return Quicklook(reduce_image(scene.image, factor).pixels, float(factor))
+    return Quicklook(quick_view(scene.image, factor), float(factor))
 
 
 def _gallery(

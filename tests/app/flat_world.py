@@ -1,5 +1,6 @@
 """A textured plane, a block of points on it, and a scene of it whose model has a known error."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
 from amers.services.formats.block.writer import write_block
 from amers.services.formats.images.raster import gdal_rpc
 from amers.services.formats.sensor_models.rpc_text import format_rpc_text
-from amers.services.imagery.source import ArrayImage, render_chip
+from amers.services.imagery.source import ArrayImage, ImageSource, render_chip
 from amers.services.sensors.rpc import RpcModel
 from amers.services.types import UNKNOWN_FRAME, Array, ChipArray, ControlPoints, FloatImage, Frame, Views
 from tests.factories import images, metadata
@@ -58,9 +59,11 @@ def make_flat_world(
     """
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(seed)
-    truth, ground = _model(size), flat_texture(size, rng)
+    truth, ground = flat_model(size), flat_texture(size, rng)
     seen = [_seen(ground, rng) for _ in range(VIEWS + 1)]
-    _write_block(folder / "block", truth, seen[:VIEWS], points, rng, frame)
+    write_flat_block(
+        folder / "block", truth, [ArrayImage(image) for image in seen[:VIEWS]], points, rng, frame
+    )
     delivered = replace(truth, image_offset=truth.image_offset - SHIFT_PX)
     image, tagged = folder / "scene.tif", folder / "tagged.tif"
     for path, model in ((image, None), (tagged, delivered)):
@@ -74,7 +77,7 @@ def make_flat_world(
     return FlatWorld(folder / "block", image, rpc_text, tagged, truth, ground)
 
 
-def _model(size: int) -> RpcModel:
+def flat_model(size: int) -> RpcModel:
     """A vertical, north-up view whose positions depend slightly on the height."""
     one = np.eye(20)[0]
     line_num, sample_num = np.zeros(20), np.zeros(20)
@@ -111,14 +114,15 @@ def _seen(ground: FloatImage, rng: np.random.Generator) -> FloatImage:
     return np.clip(gain * ground + noise, 1.0, 4095.0).astype(np.float32)
 
 
-def _write_block(
+def write_flat_block(
     folder: Path,
     model: RpcModel,
-    seen: list[FloatImage],
+    seen: Sequence[ImageSource],
     count: int,
     rng: np.random.Generator,
-    frame: Frame,
+    frame: Frame = UNKNOWN_FRAME,
 ) -> None:
+    """Write a block of points on the plane, with chips of images that all have one model."""
     size = seen[0].shape[0]
     margin = 50 * GSDS_M[-1] / GSD_M + 20
     line_sample = rng.uniform(margin, size - margin, (count, 2))
@@ -126,9 +130,7 @@ def _write_block(
 
     def chips(row: int) -> ChipArray:
         cut = [
-            render_chip(ArrayImage(image), model, points.lon_lat_h[row], gsd_m)
-            for gsd_m in GSDS_M
-            for image in seen
+            render_chip(image, model, points.lon_lat_h[row], gsd_m) for gsd_m in GSDS_M for image in seen
         ]
         return np.rint(np.stack(cut)).astype(np.uint16)
 

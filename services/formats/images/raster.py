@@ -124,6 +124,16 @@ class RasterImage:
             self._fill(inside, RasterWindow(sample, line, samples, lines))
         return out
 
+    def sampled(self, window: Window, shape: tuple[int, int]) -> FloatImage:
+        """Pixels of a window inside the image, spread evenly; see `SampledSource`.
+
+        Raises:
+            FormatError: the file cannot be read there.
+        """
+        out = np.empty(shape, dtype=np.float32)
+        self._fill(out, RasterWindow(window.sample, window.line, window.samples, window.lines))
+        return out
+
     def close(self) -> None:
         """Close the file; it cannot be read afterwards."""
         self.pixels.close()
@@ -149,7 +159,7 @@ class RasterImage:
                 self._fill_band(out, dataset, self.band, window)
             else:
                 self._fill_mix(out, dataset, window)
-            hidden = self.validity.hidden(dataset, window)
+            hidden = self.validity.hidden(dataset, window, out.shape)
         if hidden is not None:
             out[hidden] = np.nan
 
@@ -176,7 +186,7 @@ class RasterImage:
     def _fill_band(
         self, out: FloatImage, dataset: rasterio.DatasetReader, band: int, window: RasterWindow
     ) -> None:
-        pixels = dataset.read(band, window=window)
+        pixels = dataset.read(band, window=window, out_shape=out.shape)
         if self.palette is None:
             out[:] = pixels
         else:

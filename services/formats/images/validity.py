@@ -64,14 +64,16 @@ class Validity:
         """Whether anything says which pixels of a band have no data."""
         return self._hides or self.nodata[band - 1] is not None
 
-    def hidden(self, dataset: rasterio.DatasetReader, window: RasterWindow) -> BoolArray | None:
-        """Where a mask or an alpha band hides a window of all bands; None without any."""
+    def hidden(
+        self, dataset: rasterio.DatasetReader, window: RasterWindow, shape: tuple[int, ...]
+    ) -> BoolArray | None:
+        """Where a mask or an alpha band hides a window, read in a shape; None without any."""
         if self.is_masked:
-            return np.asarray(dataset.read_masks(1, window=window) == 0)
+            return np.asarray(dataset.read_masks(1, window=window, out_shape=shape) == 0)
         if self.beside is not None:
-            return np.asarray(self.beside.read(1, window=window) == 0)
+            return np.asarray(self.beside.read(1, window=window, out_shape=shape) == 0)
         if self.alpha is not None:
-            return np.asarray(dataset.read(self.alpha, window=window) == 0)
+            return np.asarray(dataset.read(self.alpha, window=window, out_shape=shape) == 0)
         return None
 
     def missing(self, band: int, pixels: np.ndarray) -> BoolArray | None:

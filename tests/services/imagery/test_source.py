@@ -15,6 +15,7 @@ from amers.services.imagery.source import (
     chip_ground,
     image_gsd_m,
     low_pass,
+    quick_view,
     reduce_image,
     render_chip,
 )
@@ -35,6 +36,8 @@ half_a_percent = 0.005
 ORIGIN = np.array([5.4, 43.6, 120.0])
 SHAPE = (900, 1000)
 AMPLITUDE = 100.0
+
+most_alike = 0.99
 
 
 @dataclass(frozen=True)
@@ -351,3 +354,18 @@ def test_means_of_an_image_that_is_read_once_are_of_the_squares_asked_for() -> N
         )
     part = Window(8, 16, 32, 24)
     np.testing.assert_array_equal(cached.means(part, 4), block_means(image.read(part), 4))
+
+
+@pytest.mark.parametrize("factor", [4, 7])
+def test_a_quick_view_looks_like_the_means_and_is_missing_where_they_are(factor: int) -> None:
+    image = noise_image(smooth_px=12.0)
+    image.pixels[: 8 * factor, : 5 * factor] = np.nan
+    image.pixels[-6 * factor :, -4 * factor :] = np.inf
+    means = reduce_image(image, factor).pixels
+    view = quick_view(image, factor)
+    assert view.shape == means.shape
+    seen = np.isfinite(means)
+    np.testing.assert_array_equal(np.isnan(view), np.isnan(means))
+    assert (np.isposinf(view) != np.isposinf(means)).sum() <= max(means.shape)  # the squares of an edge
+    seen &= np.isfinite(view)
+    assert np.corrcoef(view[seen], means[seen])[0, 1] > most_alike

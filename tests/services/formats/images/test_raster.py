@@ -7,11 +7,12 @@ import pytest
 import rasterio
 from hypothesis import given
 from hypothesis import strategies as st
+from rasterio.enums import Resampling
 
 from amers.services.errors import FormatError
 from amers.services.formats.images.raster import copy_with_rpc, open_raster, write_raster
 from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
-from amers.services.imagery.source import ArrayImage, Window
+from amers.services.imagery.source import ArrayImage, Window, quick_view
 
 MODEL = parse_rpc_text((Path(__file__).parents[3] / "golden" / "invented_RPC.TXT").read_text())
 PIXELS = np.random.default_rng(5).integers(1, 4000, (90, 120)).astype(np.uint16)
@@ -78,6 +79,27 @@ def test_pixels_under_a_mask_are_nan(tmp_path: Path) -> None:
     path = write(tmp_path / "a.tif", np.stack([PIXELS, valid]), photometric="MINISBLACK", ALPHA="YES")
     read = open_raster(path).read(Window(0, 0, *PIXELS.shape))
     np.testing.assert_array_equal(np.isfinite(read), valid > 0)
+
+
+def test_a_quick_view_is_of_an_overview_where_the_file_has_one(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.tif", np.tile(PIXELS, (3, 2)))
+    with rasterio.open(path, "r+") as file:
+        file.build_overviews([2], Resampling.average)
+    other = np.full(open_raster(path).shape, 7, dtype=np.uint16)
+    with rasterio.open(path, "r+") as file:
+        file.write(other, 1)
+    view = quick_view(open_raster(path), 8)
+    assert (view != 7.0).all()
+    path = write(tmp_path / "b.tif", other)
+    np.testing.assert_array_equal(quick_view(open_raster(path), 8), np.full(view.shape, 7.0))
+
+
+def test_a_quick_view_has_no_data_where_a_mask_hides_it(tmp_path: Path) -> None:
+    valid = np.zeros(PIXELS.shape, dtype=np.uint16)
+    valid[:45] = 65535
+    path = write(tmp_path / "a.tif", np.stack([PIXELS, valid]), photometric="MINISBLACK", ALPHA="YES")
+    view = quick_view(open_raster(path), 5)
+    np.testing.assert_array_equal(np.isfinite(view), np.arange(18)[:, None].repeat(24, axis=1) < 9)
 
 
 def test_the_requested_band_is_read(tmp_path: Path) -> None:
