@@ -101,7 +101,7 @@ class WorkOptions:
     """
 
     work: Path | None = None
-    jobs: Annotated[int, typer.Option(min=1, max=1024)] = os.cpu_count() or 1
+    jobs: Annotated[int, typer.Option(min=1, max=1024, show_default="cores")] = os.cpu_count() or 1
     cluster: str | None = None
 
 

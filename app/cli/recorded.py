@@ -75,7 +75,8 @@ def _record(parameter: inspect.Parameter) -> Entry:
         "stated": {name: value for name, value in stated.items() if name not in _NOT_SHOWN},
     }
     if parameter.default is not inspect.Parameter.empty:
-        value = parameter.default
+        # What is shown of a default in words may be another value on each machine.
+        value = None if isinstance(info.show_default, str) else parameter.default
         entry["default"] = str(value) if isinstance(value, Path) else value
     return entry
 
