@@ -18,8 +18,8 @@ LONG := cape_verde continent distorted real_scenes faults image_selection load s
 
 .PHONY: demo test test-thorough test-files test-operations test-shuffled test-fast test-security test-endurance test-qgis check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput mutants postgis page chromium proxies pictures plugin release
 
-demo: postgis
-	$(BIN)/amers demo
+demo: postgis page
+	@$(BIN)/amers demo
 
 # Style, types and contracts are checked while another core compiles what all tests use and others download.
 test: $(READY)
@@ -118,19 +118,19 @@ bench-registration: $(READY)
 	$(BIN)/python -m benchmarks.stress
 
 postgis: $(READY)
-	@scripts/ensure-postgis
+	@scripts/quietly "PostgreSQL with PostGIS" scripts/ensure-postgis
 
 page: $(PAGE)
 
 $(PAGE): $(wildcard web/* web/source/*) scripts/make-page
-	@scripts/make-page
+	@scripts/quietly "Map page" scripts/make-page
 
 chromium:
-	@scripts/ensure-chromium
+	@scripts/quietly "Chromium" scripts/ensure-chromium
 
 proxies:
-	@scripts/ensure-proxies
+	@scripts/quietly "Proxies" scripts/ensure-proxies
 
 $(READY): pyproject.toml constraints.txt scripts/make-venv
-	scripts/make-venv .venv
-	touch $@
+	@scripts/quietly "Virtual environment in .venv" scripts/make-venv .venv
+	@touch $@

@@ -1,9 +1,6 @@
 """`amers demo`: the whole work on a simulated world, with nothing to configure."""
 
 import shutil
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +16,12 @@ from amers.services.quality.criteria import verdict_scope
 from amers.services.types import Array
 
 MARK = ".amers-demo"
+NEXT = """
+Report: {report}
+
+Next, before and after on the map:   amers serve --data {folder}/store
+      the block in your own store:   amers block ingest {folder}/block --publish
+      your own scenes on a base:     amers base make --help"""
 
 
 def demo(
@@ -29,13 +32,15 @@ def demo(
 ) -> None:
     """Run the whole work on a simulated world: images, block, store, registration, report."""
     folder = _empty_folder(output)
-    with _private_store() as settings, shown_progress() as progress:
-        outcome = run_demo(folder, settings, progress)
+    store = folder.absolute() / "store"
+    store.mkdir(mode=0o711)
+    with shown_progress() as progress:
+        outcome = run_demo(folder, Settings(database_url=None, data_folder=store), progress)
     if as_json:
         show_one(_document(outcome), as_json=True)
         return
     show(_rows(outcome), as_json=False)
-    typer.echo(f"\nReport: {outcome.report.absolute()}")
+    typer.echo(NEXT.format(report=outcome.report.absolute(), folder=output))
 
 
 def _empty_folder(folder: Path) -> Path:
@@ -49,18 +54,6 @@ def _empty_folder(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / MARK).touch()
     return folder
-
-
-@contextmanager
-def _private_store() -> Iterator[Settings]:
-    """Settings of a temporary store: simulated points must not mix with real ones."""
-    folder = Path(tempfile.mkdtemp(prefix="amers-demo-"))
-    # Started by root, the database server runs as another user, who has to enter the folder.
-    folder.chmod(0o711)
-    try:
-        yield Settings(database_url=None, data_folder=folder)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 LABELS = {

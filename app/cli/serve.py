@@ -6,12 +6,16 @@ connections that wait to be accepted.
 """
 
 import errno
+import ipaddress
 import logging
+import os
 import signal
 import socket
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -41,8 +45,22 @@ def serve(
         int | None, typer.Option(help="Port to listen on; default AMERS_PORT.", min=1, max=65535)
     ] = None,
     worker: Annotated[bool, typer.Option(help="Run a worker together with the API.")] = True,
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True,
+            file_okay=False,
+            help="Data folder with a private database and its files, instead of the settings.",
+        ),
+    ] = None,
 ) -> None:
-    """Run the API and one worker, until Ctrl-C."""
+    """Run the API and one worker, until Ctrl-C.
+
+    On a terminal, with a private database and a loopback address, it prints one address that opens the
+    map, signed in; it serves until the command ends.
+    """
+    if data is not None:
+        _use_folder(data.absolute())
     settings = read_settings()
     logs.configure(settings)
     supervisor = Supervisor()
@@ -51,11 +69,37 @@ def serve(
         close = stack.enter_context(ExitStack())
         for listener in listeners:
             close.enter_context(listener)
-        stack.enter_context(ready_database(settings))
+        database_url = stack.enter_context(ready_database(settings))
+        # Its token belongs to the person at the terminal, not into a log.
+        if settings.database_url is None and sys.stdout.isatty() and all(map(_is_loopback, listeners)):
+            stack.enter_context(_shown_address(database_url, listeners[0]))
         with database_watched(settings):
             supervisor.run(_children(listeners, worker), at_stop=close.close)
     if supervisor.exit_code:
         raise typer.Exit(supervisor.exit_code)
+
+
+def _use_folder(folder: Path) -> None:
+    """Settings of a private database and its files in a folder, for this process and its children."""
+    for name in ("AMERS_DATABASE_URL", "AMERS_STORAGE_URL"):
+        os.environ.pop(name, None)
+    os.environ["AMERS_DATA_FOLDER"] = str(folder)
+
+
+def _is_loopback(listener: socket.socket) -> bool:
+    return ipaddress.ip_address(listener.getsockname()[0]).is_loopback
+
+
+@contextmanager
+def _shown_address(database_url: str, listener: socket.socket) -> Iterator[None]:
+    """The address that signs in, printed; it serves as long as the context."""
+    from amers.app.usecases.local_access import signed_in_address  # only a private service needs it
+
+    host, port = listener.getsockname()[:2]
+    shown = f"[{host}]" if ":" in host else host
+    with signed_in_address(database_url, f"http://{shown}:{port}") as address:
+        typer.echo(f"Map, signed in on this machine: {address}")
+        yield
 
 
 def _children(listeners: list[socket.socket], worker: bool) -> list[Child]:

@@ -10,7 +10,9 @@ from amers.app.config import Settings
 from amers.app.db import engine
 from amers.app.usecases import storage_identity
 from amers.app.usecases.blocks import lifecycle
+from amers.app.usecases.demo_map import show_on_map
 from amers.app.usecases.image_production import ProductionImages, run_image_production
+from amers.app.usecases.installation import Installation
 from amers.app.usecases.new_block import BlockIdentity
 from amers.app.usecases.registration.control_sources import points_of_store
 from amers.app.usecases.registration.register import (
@@ -107,7 +109,7 @@ def run_demo(folder: Path, settings: Settings, progress: Progress) -> DemoOutcom
 
     Args:
         folder: for images, block and report; must be empty.
-        settings: of a store for the demonstration alone.
+        settings: of a store for the demonstration alone, which keeps the block, the scene and its jobs.
         progress: receives the fraction done and a message.
     """
     truth = _simulate(progress)
@@ -134,11 +136,13 @@ def run_demo(folder: Path, settings: Settings, progress: Progress) -> DemoOutcom
                 SceneFiles(image, sigma_m=sigma_m),
                 ControlSources(find_points),
                 new,
-                progress=part_of(progress, 0.75, 0.25),
+                progress=part_of(progress, 0.75, 0.15),
             )
         with database.transaction() as connection:
             record_registration(connection, registered, image_key(image))
         n_served = len(find_points(registered.footprint).points)
+        progress(0.9, "registering the scene in the service, and drawing it on the map")
+        show_on_map(Installation(database, storage, settings), image, sigma_m)
     counts = DemoCounts(len(production.points), ingested.block.n_points, n_served)
     report = folder / "registered" / "report.html"
     return _compare(truth, production, registered.registration, counts, report)

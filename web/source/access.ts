@@ -6,6 +6,7 @@ import { fill, h, problem } from "./elements";
 import type { ShowView } from "./view";
 
 export type Caller = Pick<TokenRecord, "name" | "scopes">;
+const LOOPBACK = /^(localhost|127\.\d+\.\d+\.\d+|\[::1\])$/;
 const INCLUDED: Record<Scope, Scope[]> = {
   read: ["read"],
   monitor: ["monitor"],
@@ -23,6 +24,19 @@ export async function whoCalls(): Promise<Caller | null> {
     if (error instanceof Refused && error.status === 401) setToken(null);
     throw error;
   }
+}
+
+/**
+ * Keep the token of the address that `amers serve` prints, and take it out of the address.
+ *
+ * Only on this machine: elsewhere a link could sign a reader in as somebody else.
+ */
+export function takeToken(): void {
+  const given = new URLSearchParams(location.hash.slice(1));
+  const secret = given.get("token");
+  if (!secret || token() || !LOOPBACK.test(location.hostname)) return;
+  setToken(secret);
+  history.replaceState(null, "", `#${given.get("at") ?? "/points"}`);
 }
 
 export const showAccess: ShowView = async ({ panel, scopes }) => {

@@ -30,6 +30,8 @@ export function imageOnMap({ atlas, signal }: Place, registration: StatusInfo, r
   const state = h("div", { role: "status" });
   const button = h("button", { type: "button", onclick: () => void open() }, "Show the image on the map");
   const section = h("section", { "aria-label": "Image on the map" }, h("h2", {}, "Image on the map"), h("p", {}, button), state);
+  // The third word of the address asks for the image at once.
+  if (location.hash.endsWith("/map")) void open();
   return section;
 
   async function open(): Promise<void> {

@@ -1,6 +1,6 @@
 // The start of the page: the caller, the map, and the view that the address names.
 
-import { type Caller, showAccess, whoCalls } from "./access";
+import { type Caller, showAccess, takeToken, whoCalls } from "./access";
 import { showAdministration } from "./administration";
 import { Refused } from "./api";
 import { Atlas } from "./atlas";
@@ -33,6 +33,7 @@ const access = document.getElementById("access")!;
 let leaving = new AbortController();
 
 async function start(): Promise<void> {
+  takeToken();
   const atlas = new Atlas(document.getElementById("map")!, (id) => go(`#/point/${id}`));
   const caller = await whoCalls().catch(() => null);
   if (caller) access.textContent = caller.name;
