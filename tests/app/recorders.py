@@ -19,6 +19,11 @@ import pytest
 RECORDED = ("amers.app.", "amers.services.")
 CALLED = ("amers.app.config", "amers.services.docstrings")
 """Modules that are called as they are."""
+OUTPUT = "amers.app.cli.output"
+SHOWING = ("show", "show_one", "print_json")
+"""Functions of the command line by which results are shown."""
+LEFT_OUT = ("seconds", "_mock", "_spec")
+"""How keys begin whose values are of this run alone, or of the stand-ins."""
 OF_ONE = ("stored_scenes",)
 """Functions whose result stands for one thing, in a list."""
 _CONVERTED = ("parse_", "printable", "by_", "checked_", "named_", "box_of", "stated_", "file_place")
@@ -82,6 +87,8 @@ class Recorders:
         if isinstance(value, ModuleType):
             return _RecordedModule(self, value) if self._is_recorded(value.__name__) else None
         of = getattr(value, "__module__", "") or ""
+        if inspect.isfunction(value) and of == OUTPUT and value.__name__ in SHOWING:
+            return self.of(value)
         if inspect.isfunction(inspect.unwrap(value)) and self._is_recorded(of):  # type: ignore[arg-type]
             return None if value.__name__.startswith(_CONVERTED) else self.of(value)
         return None
@@ -116,16 +123,24 @@ class _RecordedModule:
 
 def leaves(path: str, value: Any, depth: int = 0) -> Iterator[tuple[str, str]]:
     """The values in a value, each with the path that leads to it."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type) and depth < 6:
-        for field in dataclasses.fields(value):
-            yield from leaves(f"{path}.{field.name}", getattr(value, field.name, None), depth + 1)
-    elif isinstance(value, dict) and depth < 6:
-        for key, one in value.items():
-            yield from leaves(f"{path}[{key}]", one, depth + 1)
-    elif isinstance(value, list | tuple) and depth < 6:
-        for number, one in enumerate(value):
-            yield from leaves(f"{path}[{number}]", one, depth + 1)
+    parts = _parts(value) if depth < 6 else None
+    if parts is not None:
+        for name, part in parts.items():
+            yield from leaves(f"{path}{name}", part, depth + 1)
+    elif isinstance(value, Anything):
+        yield path, value._extract_mock_name()
     elif isinstance(value, np.ndarray):
         yield path, str(value.tolist())
     elif isinstance(value, str | int | float | Path | UUID | Enum | datetime | type(None)):
         yield path, str(value)
+
+
+def _parts(value: Any) -> dict[str, Any] | None:
+    """What a value consists of, by its place; None for a single value."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f".{one.name}": getattr(value, one.name, None) for one in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {f"[{key}]": one for key, one in value.items() if not str(key).startswith(LEFT_OUT)}
+    if isinstance(value, list | tuple):
+        return {f"[{number}]": one for number, one in enumerate(value)}
+    return None

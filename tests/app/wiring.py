@@ -23,10 +23,12 @@ from typer.testing import CliRunner
 from amers.app.cli.commands import COMMANDS
 from amers.app.cli.main import app
 from amers.app.cli.on_demand import Group, Tree, _load
-from tests.app.recorders import Recorders
+from tests.app.recorders import SHOWING, Recorders
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "wiring.json"
 PACKAGE = "amers.app.cli."
+SHOWN = "what is shown"
+"""Beside the options of a command: its result, as it goes to the terminal."""
 SERVICES = ("demo", "serve", "worker")
 """Commands that run services, which no recorder ends."""
 AN_ID = "01234567-89ab-4cde-8f01-23456789abcd"
@@ -168,6 +170,7 @@ def _file(parameter: Any, folder: Path) -> Path:
 def run(words: list[str], folder: Path) -> list[tuple[str, str]]:
     """What a command hands on, without the names of temporary folders."""
     with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setenv("AMERS_DATA_FOLDER", str(folder / "data"))
         recorders = Recorders(monkeypatch, PACKAGE)
         with contextlib.suppress(Exception):
             result = CliRunner().invoke(app, words)
@@ -184,8 +187,9 @@ def wiring(words: tuple[str, ...], folder: Path) -> dict[str, list[str]]:
     (folder / "beside").write_text("")
     beside = [str(folder / "beside") if w == "FILE" else w for w in BESIDE.get(" ".join(words), ())]
     required = [word for one in own if one.required for word in value_of(one, folder)] + beside
-    found = {}
+    found: dict[str, list[str]] = {}
     base = run([*words, *required], folder)
+    found[SHOWN] = sorted({f"{path} = {text}" for path, text in base if path.startswith(SHOWING)})
     bases: dict[tuple[str, ...], list[tuple[str, str]]] = {(): base}
     names = {name for one in own for name in one.opts}
     for one in own:
