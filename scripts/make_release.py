@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[1]
 PAGE = Path("app/web/built")
 """What `make page` writes; it is not under version control."""
 PACKAGES = ("app", "migrations", "services")
-SUFFIXES = {".py", ".html", ".css", ".sql", ".mako", ".typed"}
+SUFFIXES = {".py", ".html", ".css", ".json", ".sql", ".mako", ".typed"}
 """Of the files of a package, beside the page."""
 
 
