@@ -93,11 +93,13 @@ class Frame:
             deformations, by the errors of its images. It is part of the covariance of every point; zero
             where it is not stated.
         how_to_state: what a user gives to state it; "" where nothing can be given.
+        assumed: what it follows from that nobody stated, and what would state it; "" where all is stated.
     """
 
     covariance_m2: Array
     shared_m2: Array = field(default_factory=lambda: np.zeros((3, 3)))
     how_to_state: str = field(default="", compare=False)
+    assumed: str = field(default="", compare=False)
 
     @classmethod
     def from_sigmas(cls, horizontal_m: float, up_m: float) -> Self:

@@ -26,7 +26,7 @@ from amers.services.formats.addresses import Address, FilePlace
 from amers.services.formats.adjusted_images import write_adjusted_images
 from amers.services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification
 from amers.services.formats.block.writer import write_block
-from amers.services.formats.images.scenes import read_scene
+from amers.services.formats.images.scenes import UNKNOWN_SIGMA_M, read_scene
 from amers.services.formats.stac.catalogue import read_catalogue
 from amers.services.formats.stac.places import image_place
 from amers.services.formats.stac.scenes import read_item_scene
@@ -37,7 +37,7 @@ from amers.services.reports.block_adjustment import adjustment_report, points_cs
 from amers.services.reports.block_adjustment_pages import ADJUSTMENT_PAGE
 from amers.services.sensors.refined import refined_rpc
 from amers.services.sensors.rpc import RpcModel
-from amers.services.statements import gathered
+from amers.services.statements import Subject, Use, gathered
 from amers.services.tasks import Work
 from amers.services.types import Progress, no_progress, part_of
 
@@ -130,6 +130,8 @@ def run_image_production(
         )
         stated = chain(*(scene.statements for scene in scenes), control.statements, ground.statements)
         production = replace(production, statements=gathered(stated))
+        if control.neighbour is None and len(production.control) == 0:
+            production = _with_what_was_assumed(production, scenes)
         # Before the block, whose folder would refuse the run that makes up for a missing report.
         _write_report(report_folder, identity.id, production)
         write_block(
@@ -144,6 +146,25 @@ def run_image_production(
     if place.folder is None:
         shutil.rmtree(work_folder)
     return production
+
+
+def _with_what_was_assumed(production: Production, scenes: Sequence[Scene]) -> Production:
+    """The frame of the points says so where it follows from an accuracy that nobody stated."""
+    unstated = sum(
+        statement.subject is Subject.ACCURACY and statement.use is Use.ASSUMED
+        for scene in scenes
+        for statement in scene.statements
+        if scene.sigma_m == UNKNOWN_SIGMA_M
+    )
+    if unstated == 0:
+        return production
+    assumed = (
+        f"nobody stated the accuracy of the models of {unstated} of {len(scenes)} images, "
+        f"{UNKNOWN_SIGMA_M:g} m each; state it with --sigma-m, or give --control"
+    )
+    [frame] = production.points.frames
+    points = replace(production.points, frames=(replace(frame, assumed=assumed),))
+    return replace(production, points=points)
 
 
 def _write_report(folder: Path, block: str, production: Production) -> None:

@@ -185,7 +185,8 @@ def _of_vertices(ce90_m: Array) -> str:
 
 
 def _with_reason(words: str, frame: Frame) -> str:
-    reason = why_unknown(frame)
+    assumed = f"assumed: {frame.assumed}" if frame.assumed else ""
+    reason = why_unknown(frame) or assumed
     return f"{words}: {reason}" if reason else words
 
 

@@ -18,7 +18,8 @@ def weighted_frame(frames: Sequence[Frame], weights: Array) -> Frame:
     """The mean of the covariances of frames, and of what points share in them, by their weights (n,).
 
     Whatever the correlation between the errors of the frames, the covariance of their weighted mean
-    cannot exceed this (the square is convex). It is unknown where a frame of positive weight is.
+    cannot exceed this (the square is convex). It is unknown where a frame of positive weight is, and
+    assumed where one is.
     """
     used = weights > 0.0
     if not used.any():
@@ -27,7 +28,8 @@ def weighted_frame(frames: Sequence[Frame], weights: Array) -> Frame:
         np.average(np.array(matrices)[used], axis=0, weights=weights[used])
         for matrices in zip(*((frame.covariance_m2, frame.shared_m2) for frame in frames), strict=True)
     )
-    return Frame(covariance_m2, shared_m2)
+    assumed = [frame.assumed for frame, is_used in zip(frames, used, strict=True) if is_used]
+    return Frame(covariance_m2, shared_m2, assumed=next(filter(None, assumed), ""))
 
 
 def frame_le90_m(frame: Frame) -> float:

@@ -265,3 +265,19 @@ def test_what_is_made_is_a_valid_block(block, production) -> None:
     points = read_block(block).points
     assert len(points) > 20
     assert np.isfinite(points.lon_lat_h).all()
+
+
+@pytest.mark.long
+@pytest.mark.thorough
+def test_a_block_of_images_that_state_no_accuracy_says_that_it_was_assumed(images, tmp_path) -> None:
+    folder = tmp_path / "block"
+    run_image_production(replace(images, sigma_m=None), folder, BlockIdentity("unstated"), OPTIONS)
+    (frame,) = read_block(folder).points.frames
+    assert frame.assumed == (
+        "nobody stated the accuracy of the models of 3 of 3 images, 50 m each; state it with "
+        "--sigma-m, or give --control"
+    )
+    report = json.loads((tmp_path / "block.adjustment" / "report.json").read_text())
+    assert report["on_the_earth"]["words"].endswith(f": assumed: {frame.assumed}")
+    page = (tmp_path / "block.adjustment" / "report.html").read_text()
+    assert 'class="verdict usable"' in page

@@ -32,7 +32,9 @@ export function facts(rows: Record<string, Child>): HTMLElement {
 
 /** The two accuracies that every place states, in their words and order; earlier reports have none. */
 export function accuracy({ relative_to_control_points: relative, on_the_earth: earth }: Stated): HTMLElement | null {
-  return relative && earth ? facts({ [relative.label]: relative.words, [earth.label]: earth.words }) : null;
+  if (!relative || !earth) return null;
+  const assumed = earth.words.includes(": assumed: ");
+  return facts({ [relative.label]: relative.words, [earth.label]: h("span", { class: assumed ? "assumed" : null }, earth.words) });
 }
 
 interface Stated {

@@ -7,7 +7,8 @@ import numpy as np
 from amers.services.errors import FormatError
 from amers.services.types import UNKNOWN_FRAME, Array, Frame
 
-FrameJson = dict[str, list[list[float | None]]]
+_LONGEST_TEXT = 300
+FrameJson = dict[str, list[list[float | None]] | str]
 
 
 def format_frame(frame: Frame) -> FrameJson | None:
@@ -18,6 +19,8 @@ def format_frame(frame: Frame) -> FrameJson | None:
     stated: FrameJson = {"covariance_m2": [[None if math.isnan(v) else v for v in row] for row in rows]}
     if frame.shared_m2.any():
         stated["shared_m2"] = frame.shared_m2.tolist()
+    if frame.assumed:
+        stated["assumed"] = frame.assumed
     return stated
 
 
@@ -34,9 +37,10 @@ def parse_frame(stated: object, sigma_m: float | None) -> Frame:
     """
     if stated is None:
         return UNKNOWN_FRAME if sigma_m is None else Frame.from_sigmas(sigma_m, math.nan)
-    rows, shared = stated, None
+    rows, shared, assumed = stated, None, ""
     if isinstance(stated, dict):
         rows, shared = stated.get("covariance_m2"), stated.get("shared_m2")
+        assumed = _sentence(stated.get("assumed", ""))
     covariance = _matrix(rows)
     if not _is_covariance(covariance):
         raise FormatError(
@@ -44,14 +48,24 @@ def parse_frame(stated: object, sigma_m: float | None) -> Frame:
             "expected, null in the row and column of a coordinate that is unknown"
         )
     if shared is None:
-        return Frame(covariance)
+        return Frame(covariance, assumed=assumed)
     shared_m2 = _matrix(shared)
     if not _is_covariance(shared_m2) or np.isnan(shared_m2).any():
         raise FormatError(
             f"block.json: amers:frame: shared_m2: {shared!r:.120} found, a 3 x 3 covariance in square "
             "metres expected; leave it out where it is not known"
         )
-    return Frame(covariance, shared_m2)
+    return Frame(covariance, shared_m2, assumed=assumed)
+
+
+def _sentence(stated: object) -> str:
+    """What was assumed of a frame."""
+    if not isinstance(stated, str) or len(stated) > _LONGEST_TEXT or not (stated + " ").isprintable():
+        raise FormatError(
+            f"block.json: amers:frame: assumed: {stated!r:.120} found, a sentence of at most "
+            f"{_LONGEST_TEXT} characters expected"
+        )
+    return stated
 
 
 def _matrix(rows: object) -> Array:

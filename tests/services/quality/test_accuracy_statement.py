@@ -72,6 +72,15 @@ def test_the_words_say_of_what_part_of_the_image_they_speak(share: float, words:
         assert f"(worst place of the {words} of the image that points hold)" in line
 
 
+def test_the_words_on_the_earth_say_what_was_assumed():
+    frame = Frame(np.eye(3), assumed="nobody stated the accuracy of the models; give --sigma-m")
+    stated = scene_accuracy(1.0, 3.0, frame, 100.0)
+    assert "assumed" not in stated.relative_to_control_points.words
+    assert stated.on_the_earth.words.endswith(f": assumed: {frame.assumed}")
+    points = points_accuracy(np.eye(3), frame, "median")
+    assert points.on_the_earth.words.endswith(f": assumed: {frame.assumed}")
+
+
 def test_the_words_say_what_is_unknown_and_why():
     nothing = scene_accuracy(0.11, np.nan, UNKNOWN_FRAME, 100.0).lines[1]
     assert nothing == (

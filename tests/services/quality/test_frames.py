@@ -23,6 +23,12 @@ def test_a_single_frame_stays_as_it_is():
     assert_allclose(weighted_frame([frame], np.array([7.0])).covariance_m2, frame.covariance_m2)
 
 
+def test_a_frame_of_several_is_assumed_where_one_of_those_that_count_is():
+    stated, assumed = Frame(np.eye(3)), Frame(4.0 * np.eye(3), assumed="50 m")
+    assert weighted_frame((stated, assumed), np.array([1.0, 0.1])).assumed == "50 m"
+    assert weighted_frame((stated, assumed), np.array([1.0, 0.0])).assumed == ""
+
+
 @pytest.mark.parametrize("correlation", [-1.0, 0.0, 0.7, 1.0])
 def test_frames_are_never_known_worse_than_stated_whatever_their_correlation(correlation):
     rng = np.random.default_rng(2)

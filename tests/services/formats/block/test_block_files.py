@@ -230,6 +230,22 @@ def test_a_block_states_what_its_points_share(tmp_path):
     assert_array_equal(frame.shared_m2, shared_m2)
 
 
+def test_a_block_says_what_its_frame_assumes(tmp_path):
+    points = control_points(3, np.random.default_rng(1))
+    stated = Frame(np.eye(3), assumed="nobody stated the accuracy of two models")
+    write_block(tmp_path / "block", replace(metadata(), frame=stated), points, noise_chips(points), {})
+    (frame,) = check_block(tmp_path / "block").points.frames
+    assert frame.assumed == stated.assumed
+
+
+@pytest.mark.parametrize("assumed", [7, "a" * 301, "a\nb", ["text"]])
+def test_what_a_frame_assumes_is_a_sentence_or_refused(block, assumed):
+    document = json.loads((block.folder / "block.json").read_text())
+    document["amers:frame"] = {"covariance_m2": np.eye(3).tolist(), "assumed": assumed}
+    with pytest.raises(FormatError, match="amers:frame: assumed"):
+        parse_block_json(json.dumps(document))
+
+
 @pytest.mark.parametrize("shared_m2", [[[1.0]], "0.1 m", [[1, 0, 0], [0, None, 0], [0, 0, 1]], -1])
 def test_what_points_share_is_a_covariance_or_refused(block, shared_m2):
     document = json.loads((block.folder / "block.json").read_text())
