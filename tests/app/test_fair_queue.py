@@ -198,6 +198,25 @@ def test_the_end_of_a_job_issues_no_ticket_that_nobody_needs(connection: Connect
     assert tickets(connection) == 2, "two jobs wait"
 
 
+def test_a_spent_ticket_is_replaced_once_few_are_left(
+    connection: Connection, monkeypatch: pytest.MonkeyPatch
+):
+    """With many tickets nothing is counted: claims would wait for it."""
+    monkeypatch.setattr(queue, "MANY_TICKETS", 2)
+    owner = owner_named(connection, "one")
+    for _ in range(5):
+        ask(connection, owner)
+    spend = "delete from procrastinate_jobs where id in (select min(id) from procrastinate_jobs)"
+    left = []
+    for spent in (3, 1, 0):
+        job = claim(connection)
+        for _ in range(spent):
+            run_sql(connection, spend)
+        attempts.succeed(connection, job.id, job.attempt, {})
+        left.append(tickets(connection))
+    assert left == [2, 2, 2], "4, 3 and 2 jobs wait: two tickets are many, one is replaced"
+
+
 def test_every_ticket_lies_in_the_queue_of_the_workers_under_the_name_of_their_task(
     connection: Connection,
 ):

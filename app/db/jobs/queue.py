@@ -28,6 +28,10 @@ CLAIM_LOCK = 0x414D4558
 TICKETS_PER_SWEEP = 16
 """Most tickets that one sweep replaces: the first jobs that end replace the others."""
 
+MANY_TICKETS = 256
+"""Tickets beside which a spent one is not missed yet: more than workers that claim at once."""
+
+FEW_TICKETS = named("jobs.sql", "few_tickets")
 MISSING_TICKETS = named("jobs.sql", "missing_tickets")
 PRUNE_SILENT_WORKERS = named("jobs.sql", "prune_silent_workers")
 DELETE_DEAD_ENTRIES = named("jobs.sql", "delete_dead_entries")
@@ -52,8 +56,12 @@ def lock_claims(connection: Connection) -> None:
 def replace_spent_ticket(connection: Connection) -> None:
     """Issue a ticket if there are fewer than waiting jobs; the last step of whatever ends a job.
 
-    The owner of the job may now have another one claimed, whose ticket may have been spent.
+    The owner of the job may now have another one claimed, whose ticket may have been spent. Nothing is
+    counted while many tickets are left: that would take the longer, the more jobs wait, and claims wait
+    for it. The ends of later jobs replace what is missing then.
     """
+    if not connection.scalar(FEW_TICKETS, {"task": TASK, "many": MANY_TICKETS}):
+        return
     lock_claims(connection)
     if _missing_tickets(connection, 0.0, None):
         issue_ticket(connection)

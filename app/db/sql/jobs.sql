@@ -35,6 +35,14 @@ order by heads.priority desc, coalesce(running.n, 0), job_turn.claimed_at nulls 
 limit 1
 for update of job skip locked
 
+-- name: few_tickets
+-- Whether fewer tickets than many may be taken now.
+select count(*) < :many from (
+    select 1 from procrastinate_jobs
+    where task_name = :task and status = 'todo'
+        and (scheduled_at is null or scheduled_at <= statement_timestamp())
+    limit :many) tickets
+
 -- name: missing_tickets
 -- How many jobs may be claimed beyond the tickets that are left for them.
 with owners as (
