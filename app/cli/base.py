@@ -17,7 +17,8 @@ from amers.app.cli.transaction import transaction
 from amers.app.config import Settings, read_settings
 from amers.app.storage import Storage, open_storage
 from amers.app.usecases import storage_identity
-from amers.app.usecases.base.making import MadeBase, make_base, plan
+from amers.app.usecases.base.made import MadeBase, report_folder
+from amers.app.usecases.base.making import make_base, plan
 from amers.app.usecases.base.request import BaseOptions, BaseRequest
 from amers.app.usecases.base.search import BasePlan, Candidates
 from amers.app.usecases.base.updating import update_base
@@ -191,6 +192,7 @@ def _made_row(output: Path, made: MadeBase, published: bool, *, as_json: bool) -
     return {
         "block": output,
         **({"state": "published"} if published else {}),
+        "report": report_folder(output) / "report.html",
         "points": len(made.points),
         "views": int(made.points.views.start[-1]),
         "points_per_km2": round(len(made.points) / made.area_km2, 2),

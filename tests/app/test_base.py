@@ -18,7 +18,8 @@ import shapely
 
 from amers.app.errors import InputError
 from amers.app.usecases.base import making
-from amers.app.usecases.base.making import MadeBase, make_base, plan
+from amers.app.usecases.base.made import MadeBase
+from amers.app.usecases.base.making import make_base, plan
 from amers.app.usecases.base.request import BaseOptions, BaseRequest
 from amers.app.usecases.image_production import WorkPlace
 from amers.app.usecases.new_block import BlockIdentity

@@ -64,8 +64,13 @@ def test_one_command_publishes_a_base_from_a_catalogue_with_faults(
     made = json.loads(done.stdout)
     assert made["state"] == "published"
     assert made["cpu_s_per_point"] > 0.0
+    page = Path(made["report"]).read_text()
+    assert "Contains modified Copernicus Sentinel data 2021" in page
+    report = json.loads(Path(made["report"]).with_suffix(".json").read_text())
+    assert sorted({one["date"] for one in report["images"]}) == made["dates"]
+    assert report["points"] == made["points"]
     assert served(bearer("admin")) > 0.8 * made["points"] > 15
-    assert [path.name for path in (tmp_path / "made").iterdir()] == ["valley"]
+    assert {path.name for path in (tmp_path / "made").iterdir()} == {"valley", "valley.report"}
 
 
 def test_a_publication_that_is_interrupted_goes_on_with_the_same_command(
@@ -91,7 +96,7 @@ def test_a_publication_that_is_interrupted_goes_on_with_the_same_command(
         assert len(server.sent) == read, "nothing was read again"
     assert done.returncode == 0, done.stderr
     assert served(admin) > 15
-    assert [path.name for path in (tmp_path / "made").iterdir()] == ["valley"]
+    assert {path.name for path in (tmp_path / "made").iterdir()} == {"valley", "valley.report"}
 
 
 def test_a_store_that_cannot_be_used_is_named_before_anything_is_read(

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from amers.app.usecases.base.making import MadeBase, make_base
+from amers.app.usecases.base.made import MadeBase
+from amers.app.usecases.base.making import make_base
 from amers.app.usecases.base.request import BaseOptions, BaseRequest
 from amers.app.usecases.new_block import BlockIdentity
 from amers.services.formats.images.raster import write_raster
@@ -107,10 +108,10 @@ class Errors:
         )
 
     def check(self) -> None:
-        """Errors are as large as stated: within a fifth on the base, on average over all places."""
+        """Errors are as large as stated, or up to two fifths smaller, on average over all places."""
         rms = float(np.sqrt(np.mean(self.relative)))
         print(f"{len(self.relative)} scenes: {rms:.2f} of the stated sigma")
-        assert 0.8 <= rms <= 1.25
+        assert 0.6 <= rms <= 1.2
         assert (np.array(self.worst) < 1.3).mean() >= 0.8
         assert (np.array(self.earth) < 1.0).mean() >= 0.8
         assert np.mean(self.lost) < 0.05

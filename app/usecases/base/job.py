@@ -10,7 +10,8 @@ from amers.app.config import Settings
 from amers.app.db.engine import Connection
 from amers.app.db.tokens import Token
 from amers.app.errors import InputError
-from amers.app.usecases.base.making import MadeBase, make_base
+from amers.app.usecases.base.made import MadeBase
+from amers.app.usecases.base.making import make_base
 from amers.app.usecases.base.request import BaseOptions, BaseRequest, area_of
 from amers.app.usecases.blocks import lifecycle
 from amers.app.usecases.image_production import WorkPlace

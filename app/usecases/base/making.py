@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import shapely
 
+from amers.app.usecases.base.made import BaseSource, MadeBase, report_folder, write_base_report
 from amers.app.usecases.base.request import BaseOptions, BaseRequest, archive_of, area_km2, area_of
 from amers.app.usecases.base.search import (
     BasePlan,
@@ -40,6 +41,7 @@ from amers.app.usecases.new_block import (
     points_per_km2,
     refuse_existing,
 )
+from amers.app.usecases.registration.result_folder import older_result
 from amers.app.usecases.terrain_file import TerrainFile, read_terrain
 from amers.services.formats.addresses import without_query
 from amers.services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification
@@ -59,44 +61,6 @@ _OPTIONS, _HERE = BaseOptions(), WorkPlace()
 
 PutBlock = Callable[[Path], object]
 """Moves a whole block, which lies beside its folder, into it: one that is published, for example."""
-
-
-@dataclass(frozen=True)
-class MadeBase:
-    """A base, and what it took.
-
-    Attributes:
-        points: of the block.
-        placed: its images, and the frames of their dates.
-        area_km2: of the region.
-        left_out: words for images that were chosen and not used.
-        bytes: read at addresses by this command.
-        pixels, full_pixels: read, and of the whole images.
-        local_sigma_m: of details; NaN when unknown.
-        attribution: of the data.
-        effort: of the tasks, by their stage.
-    """
-
-    points: ControlPoints
-    placed: PlacedDates
-    area_km2: float
-    left_out: list[str]
-    bytes: int
-    pixels: int
-    full_pixels: int
-    local_sigma_m: float
-    attribution: str
-    effort: dict[str, Effort]
-
-    @property
-    def cpu_s(self) -> float:
-        """Seconds of a core that all tasks took."""
-        return sum(one.cpu_s for one in self.effort.values())
-
-    @property
-    def images(self) -> int:
-        """Number of images."""
-        return sum(len(tile.images) for tile in self.placed.tiles)
 
 
 @dataclass(frozen=True)
@@ -177,6 +141,7 @@ def make_base(
         ComputationError: the images have too few points in common.
     """
     refuse_existing(folder)
+    older_result(report_folder(folder))
     making = Making(request, options, area_of(request), archive_of(request.source))
     kept = place.folder or folder.with_name(f"{folder.name}.work")
     WorkFolder(kept, _inputs(making))
@@ -246,6 +211,10 @@ class Finishing:
             whole = folder.with_name(f"{folder.name}.whole")
             shutil.rmtree(whole, ignore_errors=True)
             write_block(whole, metadata, points, chips, {}, progress=part_of(progress, 0.8, 0.2))
+        # Before the block, whose folder would refuse the run that makes up for a missing report.
+        unused = len(reader.candidates.problems)
+        source = BaseSource(making.area, making.archive, catalogues_of(making.request), unused)
+        write_base_report(folder, identity.id, made, source)
         if put is None:
             whole.rename(folder)
         else:
@@ -266,10 +235,15 @@ class Finishing:
         partial.rename(path)
 
 
+def catalogues_of(request: BaseRequest) -> tuple[str, ...]:
+    """The catalogues of a request without signatures."""
+    return tuple(without_query(one) for one in request.catalogues)
+
+
 def _inputs(making: Making) -> dict[str, Any]:
     """What the content of a work folder depends on; signatures of addresses change."""
     request = asdict(making.request)
-    request["catalogues"] = [without_query(one) for one in making.request.catalogues]
+    request["catalogues"] = list(catalogues_of(making.request))
     return {
         "request": request,
         "options": asdict(making.options),
@@ -303,6 +277,7 @@ def _made(
         pixels=reader.pixels,
         full_pixels=reader.full_pixels,
         local_sigma_m=float(np.nanmax(local_m)) if np.isfinite(local_m).any() else math.nan,
+        clear={image.id: reader.clear_of(image.id) for image in images},
         attribution=attribution,
         effort=effort,
     )
@@ -328,7 +303,7 @@ def _metadata(
         options={
             **asdict(making.options),
             "archive": archive.name,
-            "catalogues": [without_query(one) for one in making.request.catalogues],
+            "catalogues": list(catalogues_of(making.request)),
             "attribution": made.attribution,
             "terms": archive.terms,
         },

@@ -9,7 +9,8 @@ import numpy as np
 import shapely
 
 from amers.app.errors import InputError
-from amers.app.usecases.base.making import CANDIDATES, CHOSEN, Finishing, MadeBase, Making, PutBlock
+from amers.app.usecases.base.made import MadeBase
+from amers.app.usecases.base.making import CANDIDATES, CHOSEN, Finishing, Making, PutBlock
 from amers.app.usecases.base.request import BaseOptions, BaseRequest, archive_of
 from amers.app.usecases.base.search import Candidates, read_candidates, write_candidates
 from amers.app.usecases.base.windows import WindowReader

@@ -143,6 +143,10 @@ class WindowReader:
 
         return with_fresh_addresses(self.candidates.items, number, self.archive, read)
 
+    def clear_of(self, name: str) -> float:
+        """The same by the id of the image."""
+        return self.clear([image.id for image in self.candidates.images].index(name))
+
     def clear(self, number: int) -> float:
         """Clear share of the region in an image that was taken."""
         record = self.path(number).with_suffix(".json")
