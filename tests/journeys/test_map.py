@@ -283,3 +283,32 @@ def test_without_a_setting_there_is_no_background(visit, secret, service):
     until_drawn(page)
     expect(page.locator(".attribution")).to_have_text(MAKER_OF_TOWNS)
     assert httpx.get(f"{service.url}/map/background.json").json() == {"tiles": None, "attribution": None}
+
+
+def test_the_map_names_who_made_the_data_of_the_published_blocks_in_view(
+    visit, secret, amers, tmp_path: Path
+) -> None:
+    made = make_block(tmp_path / "open", name="open", box=(7.0, 44.0, 7.1, 44.1))
+    file = made.folder / "block.json"
+    document = json.loads(file.read_text())
+    document["amers:provenance"]["options"]["attribution"] = ATTRIBUTION
+    file.write_text(json.dumps(document))
+    number = amers("block", "ingest", made.folder)["block"]["number"]
+    staged = visit("#/points", secret, WIDE)
+    until_drawn(staged)
+    expect(staged.get_by_text(ATTRIBUTION)).to_have_count(0)
+    amers("block", "publish", str(number))
+    page = visit("#/points", secret, WIDE)
+    for place, count in (("44.05, 7.05", 1), ("-33.0, 151.0", 0)):
+        field = page.get_by_label("Go to")
+        field.fill(place)
+        field.press("Enter")
+        until_drawn(page)
+        expect(page.locator(".attribution").get_by_text(ATTRIBUTION)).to_have_count(count)
+    field.fill("44.05, 7.05")
+    field.press("Enter")
+    until_drawn(page)
+    expect(page.locator(".attribution")).to_contain_text(f"{ATTRIBUTION} · {MAKER_OF_TOWNS}")
+    assert_readable(page, "map-block-makers")
+    page = visit(f"#/block/{number}", secret, WIDE)
+    expect(page.locator(".facts").get_by_text(ATTRIBUTION)).to_be_visible()

@@ -57,6 +57,7 @@ export interface BlockFeatureProperties {
   id?: string;
   version?: string;
   title?: string;
+  attribution?: string | null;
   state?: "staged" | "published" | "withdrawn";
   priority?: number;
   n_points?: number;

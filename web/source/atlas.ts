@@ -48,6 +48,7 @@ export class Atlas {
   private colouring: Colouring = "none";
   private land = landFile(0);
   private namesTowns = false;
+  private blocks: Outlined[] = [];
   private picked: ((position: Position, point?: number) => void) | null = null;
   /** Whether the reader has gone to a place: the page then does not move the map by itself. */
   went = false;
@@ -64,6 +65,7 @@ export class Atlas {
     void this.ready.then(() => this.whileMoving(() => this.drawGraticule(map), new AbortController().signal));
     void this.ready.then(() => this.whileMoving(() => this.drawLand(map), new AbortController().signal));
     void this.ready.then(() => this.whileMoving(() => this.drawTowns(map, container), new AbortController().signal));
+    void this.ready.then(() => this.whileMoving(() => this.nameMakers(), new AbortController().signal));
     void this.ready.then(() => drawBackground(map, container)).catch((error: Error) => console.warn(error.message));
     for (const event of ["movestart", "dataloading"] as const) map.on(event, () => container.setAttribute("aria-busy", "true"));
     map.on("idle", () => container.setAttribute("aria-busy", "false"));
@@ -136,6 +138,14 @@ export class Atlas {
     await this.ready;
     const layer = this.map?.getSource(source);
     if (layer instanceof GeoJSONSource) layer.setData({ type: "FeatureCollection", features } as FeatureCollection);
+    if (source !== "blocks") return;
+    this.blocks = features;
+    this.nameMakers();
+  }
+
+  /** Name on the map who made the data of the blocks in view. */
+  private nameMakers(): void {
+    if (this.map) attribute(this.map.getContainer(), "blocks", makersOf(this.blocks, this.map.getBounds()));
   }
 
   /** Show a scene through two models below its outline, until the signal aborts; null without a map. */
@@ -209,7 +219,7 @@ export class Atlas {
     if (this.namesTowns || map.getZoom() < TOWNS_ZOOM || !(source instanceof GeoJSONSource)) return;
     this.namesTowns = true;
     source.setData(BASE + TOWNS);
-    attribute(container, MAKER_OF_TOWNS);
+    attribute(container, "towns", MAKER_OF_TOWNS);
   }
 
   private drawGraticule(map: MapLibre): void {
@@ -246,14 +256,30 @@ async function drawBackground(map: MapLibre, container: HTMLElement): Promise<vo
   const address = tiles.startsWith("/") ? location.origin + tiles : tiles;
   map.addSource("background", { type: "raster", tiles: [address], tileSize: 256 });
   map.addLayer({ id: "background", type: "raster", source: "background" }, "density");
-  attribute(container, attribution ?? "");
+  attribute(container, "background", attribution ?? "");
 }
 
-/** Name on the map who made a part of it. */
-function attribute(container: HTMLElement, maker: string): void {
-  const line = container.querySelector(".attribution");
-  if (line) line.append(` · ${maker}`);
-  else container.prepend(h("p", { class: "attribution" }, maker));
+/** Name on the map who made a part of it; nobody where the name is empty. */
+function attribute(container: HTMLElement, part: string, maker: string): void {
+  const line = container.querySelector<HTMLElement>(".attribution") ?? h("p", { class: "attribution" });
+  const makers = new Map(Object.entries(line.dataset)).set(part, maker);
+  line.dataset[part] = maker;
+  line.textContent = [...makers.values()].filter(Boolean).join(" · ");
+  if (!line.textContent) line.remove();
+  else if (!line.isConnected) container.prepend(line);
+}
+
+/** What the terms of the data of published blocks in view ask to show. */
+function makersOf(blocks: Outlined[], seen: LngLatBounds): string {
+  const shown = blocks.filter(({ geometry, properties }) => properties?.["state"] === "published" && geometry && meets(positionsOf(geometry), seen));
+  return [...new Set(shown.map(({ properties }) => properties?.["attribution"] as string | null))].filter(Boolean).join(" · ");
+}
+
+/** Whether the box around positions meets what is seen, which may lie beyond 180 degrees. */
+function meets(positions: Position[], seen: LngLatBounds): boolean {
+  const box = inOnePlace(positions).reduce((box, [lon, lat]) => box.extend([lon!, lat!]), new LngLatBounds());
+  const beside = [-360, 0, 360].some((turn) => box.getWest() + turn <= seen.getEast() && box.getEast() + turn >= seen.getWest());
+  return beside && box.getSouth() <= seen.getNorth() && box.getNorth() >= seen.getSouth();
 }
 
 function opened(container: HTMLElement): MapLibre | null {

@@ -63,6 +63,7 @@ export const showBlock: ShowView = async (place, number) => {
     accuracy(quality),
     facts({
       Name: `${properties.id}, version ${properties.version}`,
+      Attribution: properties.attribution,
       Points: figure(properties.n_points),
       Chips: figure(properties.n_views),
       Area: figure(quality.area_km2, "km²"),

@@ -3,6 +3,7 @@
 from typing import get_args
 
 from sqlalchemy import Numeric, Text, and_, cast, func, or_, select
+from sqlalchemy.dialects.postgresql import ARRAY, JSONB
 
 from amers.app.db.constants import integer_constant, text_constant
 from amers.app.db.features.collection import (
@@ -18,6 +19,14 @@ from amers.app.db.schema.base import Real
 
 _BLOCK_VISIBLE = or_(block.c.state == text_constant("published"), IS_ADMIN)
 
+_ATTRIBUTION = cast(
+    func.jsonb_path_query_first(
+        block.c.metadata, text_constant('$."amers:provenance"."options"."attribution"'), type_=JSONB
+    ).op("#>>", return_type=Text())(cast(text_constant("{}"), ARRAY(Text()))),
+    Text(),
+)
+"""What the terms of the data ask to show of a block; null where it has none."""
+
 BLOCKS = Collection(
     id="blocks",
     title="Blocks",
@@ -28,6 +37,7 @@ BLOCKS = Collection(
         column_property(block.c.id, "Name of the block"),
         column_property(block.c.version, "Version"),
         column_property(block.c.title, "Title"),
+        Property("attribution", "What the terms of its data ask to show", _ATTRIBUTION, nullable=True),
         column_property(block.c.state, "State", choices=get_args(BlockState)),
         column_property(block.c.priority, "Which block comes first over one place"),
         column_property(block.c.n_points, "Points"),
