@@ -94,7 +94,7 @@ def make(
     if only_plan:
         with shown_progress() as progress:
             planned, candidates = plan(request, options, progress)
-        show_one(_plan_row(planned, candidates), as_json=as_json)
+        show_one(_plan_row(planned, candidates, place.jobs), as_json=as_json)
         return
     put = _publication(output) if publish else None
     with shown_progress() as progress:
@@ -169,7 +169,7 @@ def _publication(folder: Path) -> _Publication:
     return _Publication(folder, settings, storage)
 
 
-def _plan_row(planned: BasePlan, candidates: Candidates) -> Row:
+def _plan_row(planned: BasePlan, candidates: Candidates, jobs: int) -> Row:
     images = [candidates.images[date.image] for date in planned.dates]
     pixels = sum(date.pixels for date in planned.dates)
     return {
@@ -182,7 +182,8 @@ def _plan_row(planned: BasePlan, candidates: Candidates) -> Row:
         "size": as_size(planned.bytes),
         "bytes_per_km2": round(planned.bytes / planned.area_km2),
         "share_of_full_tiles": round(pixels / max(1, planned.full_pixels), 4),
-        "minutes": round(planned.seconds / 60.0, 1),
+        "minutes": round((planned.read_s + planned.cpu_s / jobs) / 60.0, 1),
+        "jobs": jobs,
         "items_left_out": len(candidates.problems),
     }
 

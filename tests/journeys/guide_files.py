@@ -11,12 +11,16 @@ import rasterio
 import shapely
 from rasterio.transform import Affine
 
+from amers.services.formats.images.raster import write_raster
 from amers.services.formats.vector.layers import VectorLayer, write_layer
 from amers.services.sensors.rpc import RpcModel
+from amers.services.simulation.view import ViewPlan, simulate_view
 from amers.services.types import Array, FloatImage
 from benchmarks._catalogue import simulate_catalogue, write_catalogue
 from tests.app.flat_world import GROUND_H, SIGMA_M, FlatWorld, make_flat_world
 from tests.app.joint_world import true_model, write_scene
+from tests.open_archive import CENTRE as OPEN_CENTRE
+from tests.open_archive import make_archive
 from tests.services.chip_bases import (
     CORNER_XY,
     LAND_M,
@@ -35,6 +39,8 @@ CENTRE = (5.4, 43.6)
 SIZE = 800
 """Lines and samples of all images: pixels of 0.5 m."""
 ISLAND_PX = 80
+OPEN_DATES = 7
+"""Of the mirror: the first of the simulated archive, two of which are cloudy."""
 GEOID_M = 48.0
 """Height of the invented geoids."""
 SHIFTS_PX = {
@@ -80,9 +86,21 @@ def write_guide_files(folder: Path) -> None:
     _write_images(ground)
     _write_maps(ground)
     _write_drawings(ground)
+    _write_archive(folder)
     write_catalogue(simulate_catalogue(60, 120.0, np.random.default_rng(2)), folder)
     (folder / "items.ndjson").rename(folder / "catalogue.ndjson")
     (folder / "country.geojson").write_text(shapely.to_geojson(shapely.box(14.8, -0.2, 15.2, 0.2)))
+
+
+def _write_archive(folder: Path) -> None:
+    """Write a mirror of some dates of Sentinel-2 with a region, and a scene of later on this ground."""
+    archive = make_archive(folder / "mirror", dates=OPEN_DATES)
+    lon, lat = OPEN_CENTRE
+    region = shapely.box(lon - 0.015, lat - 0.011, lon + 0.015, lat + 0.011)
+    (folder / "region.geojson").write_text(shapely.to_geojson(region))
+    plan = ViewPlan("my-scene", OPEN_CENTRE, (1200, 1200), 2.0, 8.0, 100.0)
+    view = simulate_view(archive.world, plan, np.random.default_rng(3), (34.0, -28.0))
+    write_raster(folder / "my-scene.tif", view.pixels, view.geometry.delivered)
 
 
 def _islands(pixels: FloatImage) -> FloatImage:

@@ -17,6 +17,9 @@ from tests.service_process import installed_at
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 NOT_RUN = {
+    "base make --area region.geojson --from sentinel-2 --catalogue "
+    "https://earth-search.aws.element84.com/v1 -o my-base --plan": "contacts a public server: "
+    "test_base.py plans from one of its kind",
     "production run --selection my-selection --spacing-m 1400 -o my-block": "needs six images of "
     "kilometres, which takes minutes: test_image_addresses.py makes a block of a selection",
     "serve": "runs until a signal: the first run of the README does it",
@@ -73,7 +76,9 @@ def test_a_command_of_the_guide_writes_what_it_names(done, places, line):
     assert (places[line] / line.partition(" -o ")[2].split()[0]).exists()
 
 
-@pytest.mark.parametrize("folder", ["my-block.adjustment", "my-selection", "together/block"])
+@pytest.mark.parametrize(
+    "folder", ["my-base.report", "my-result", "my-block.adjustment", "my-selection", "together/block"]
+)
 def test_a_report_that_a_command_of_the_guide_writes_is_readable(done, places, folder, browser: Browser):
     with browser.new_context() as context:
         page = context.new_page()

@@ -82,7 +82,7 @@ class BasePlan:
         terrain_bytes: estimated.
         full_pixels: of the whole images.
         points: estimated number.
-        seconds: estimated, of reading and of one core.
+        read_s, cpu_s: estimated seconds, of reading and of one core.
     """
 
     area_km2: float
@@ -91,7 +91,8 @@ class BasePlan:
     terrain_bytes: int
     full_pixels: int
     points: int
-    seconds: float
+    read_s: float
+    cpu_s: float
 
     @property
     def bytes(self) -> int:
@@ -251,9 +252,9 @@ def plan_base(
     terrain = size_km2 * 1.3e6 / COPERNICUS_DEM.gsd_m**2 * COPERNICUS_DEM.bytes_per_px
     terrain_bytes = math.ceil(terrain) if reads_terrain else 0
     mean_dates = len(dates) / max(1, len(tiles))
-    seconds = SECONDS_PER_MEGABYTE * (sum(one.bytes for one in dates) + terrain_bytes) / 1e6
-    seconds += SECONDS_PER_POINT_AND_DATE * points * mean_dates
-    return BasePlan(size_km2, tiles, dates, terrain_bytes, full, points, seconds)
+    read_s = SECONDS_PER_MEGABYTE * (sum(one.bytes for one in dates) + terrain_bytes) / 1e6
+    cpu_s = SECONDS_PER_POINT_AND_DATE * points * mean_dates
+    return BasePlan(size_km2, tiles, dates, terrain_bytes, full, points, read_s, cpu_s)
 
 
 def spacing_m(options: BaseOptions, archive: Archive, size_km2: float) -> float:
