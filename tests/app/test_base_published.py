@@ -1,10 +1,13 @@
 """From an empty store to a published base in one command: interrupted, with faults, by processes."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import rasterio
 
 from amers.app.config import Settings
 from amers.app.usecases.base.making import make_base
@@ -13,6 +16,7 @@ from amers.app.usecases.blocks import lifecycle
 from amers.app.usecases.executors import ComputeOptions
 from amers.app.usecases.image_production import WorkPlace
 from amers.app.usecases.new_block import BlockIdentity
+from amers.services.errors import NotEnoughPoints
 from amers.services.formats import addresses
 from tests.app.callers import Bearer, Caller
 from tests.app.test_production_run import content, dask_cluster
@@ -126,3 +130,16 @@ def test_processes_and_a_cluster_make_the_same_base_bit_for_bit(
     assert made("processes", ComputeOptions(jobs=2)) == alone
     with dask_cluster(2) as cluster:
         assert made("cluster", ComputeOptions(cluster=cluster.address)) == alone
+
+
+def test_ground_without_texture_gives_no_points(archive: OpenArchive, tmp_path: Path) -> None:
+    flat, rng = tmp_path / "flat", np.random.default_rng(1)
+    shutil.copytree(archive.folder, flat)
+    for path in (flat / "data").glob("*_red.tif"):
+        with rasterio.open(path, "r+") as image:
+            image.write(rng.normal(2000.0, 15.0, image.shape).astype(np.uint16), 1)
+    catalogue = str(flat / "items.json")
+    request = BaseRequest("sentinel-2", (catalogue,), bbox=BOX, geoid=archive.geoid)
+    with pytest.raises(NotEnoughPoints, match=r"^0 usable points found"):
+        make_base(request, tmp_path / "b", BlockIdentity("b"), BaseOptions(dates=3))
+    assert not (tmp_path / "b").exists()
