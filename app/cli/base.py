@@ -183,7 +183,6 @@ def _plan_row(planned: BasePlan, candidates: Candidates, jobs: int) -> Row:
         "bytes_per_km2": round(planned.bytes / planned.area_km2),
         "share_of_full_tiles": round(pixels / max(1, planned.full_pixels), 4),
         "minutes": round((planned.read_s + planned.cpu_s / jobs) / 60.0, 1),
-        "jobs": jobs,
         "items_left_out": len(candidates.problems),
     }
 
