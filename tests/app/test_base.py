@@ -224,13 +224,13 @@ def test_a_later_scene_of_10_m_is_registered_within_what_is_stated(archive, base
 
 def test_a_scene_of_2_m_is_brought_from_30_m_to_the_base(archive, base, tmp_path) -> None:
     block, made, _ = base
-    planned = ViewPlan("later-2m", CENTRE, (1400, 1400), 2.0, 12.0, 100.0)
+    planned = ViewPlan("later-2m", CENTRE, (2000, 2000), 2.0, 12.0, 100.0)
     view = simulate_view(archive.world, planned, np.random.default_rng(3), (24.0, -18.0))
     scene = tmp_path / "later-2m.tif"
     write_raster(scene, view.pixels, view.geometry.delivered)
     result = registered(scene, block, tmp_path / "out")
     refined = read_rpc(scene, tmp_path / "out" / "refined_RPC.TXT").model
-    line_sample = np.stack(np.meshgrid([200.0, 700.0, 1200.0], [200.0, 700.0, 1200.0]), -1).reshape(
+    line_sample = np.stack(np.meshgrid([300.0, 1000.0, 1700.0], [300.0, 1000.0, 1700.0]), -1).reshape(
         -1, 2
     )
     ground = view.geometry.rpc.locate(line_sample, np.full(9, 200.0))
