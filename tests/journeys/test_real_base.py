@@ -112,3 +112,20 @@ def test_the_pair_of_maricopa_makes_a_base_that_both_images_are_found_on(
     print({name: value for name, value in made.items() if name != "attribution"})
     assert made["dates_apart_m"] < 10.0
     assert made["local_sigma_m"] > 0.5, "the shifts within the pair are up to 7 m, and are stated"
+
+
+def test_may_is_registered_on_points_of_june_alone_far_better_than_stated(
+    real_data: Path, amers, tmp_path: Path
+) -> None:
+    """What is stated is not exceeded; chips of one image have its offset, which no other one shows."""
+    (june,) = (real_data / "s2a_berlin_pair").glob("ref_*.tif")
+    (may,) = (real_data / "s2a_berlin_pair").glob("tgt_*.tif")
+    catalogue_of(tmp_path, {"2016-06-08": june})
+    terrain = ["--dem", tmp_path / "level.tif", "--vertical", "ellipsoid", "--height-sigma-m", "30"]
+    amers("production", "ortho", june, "--sigma-m", "1", *terrain, "-o", tmp_path / "june")
+    result = amers("scene", "register", may, "--block", tmp_path / "june", "-o", tmp_path / "may")
+    line_px, sample_px = result["shift_px"]
+    off_m = np.abs([sample_px, line_px]) * 10.0 - MAY_OFF_M
+    print(f"{np.linalg.norm(off_m):.2f} m, stated {result['relative_to_control_points']['words']}")
+    assert result["verdict"] == "good"
+    assert np.linalg.norm(off_m) < 0.5 < result["relative_to_control_points"]["ce90_m"]
