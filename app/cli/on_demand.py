@@ -79,8 +79,8 @@ class GroupOnDemand(TyperGroup):
         """The command to run, and the rest of the arguments."""
         name, _, rest = super().resolve_command(ctx, args)
         entry = self._tree[str(name)]
-        if isinstance(entry, Command) and "--help" in rest:
-            return name, _as_command(str(name), recorded(entry.function)), rest
+        if isinstance(entry, Command) and "--help" in rest and (shown := recorded(entry.function)):
+            return name, _as_command(str(name), shown), rest
         return name, self.commands[str(name)], rest
 
 

@@ -29,13 +29,15 @@ _NOT_SHOWN = ("parser", "callback", "shell_complete", "autocompletion")
 Entry = dict[str, Any]
 
 
-def recorded(function: str) -> Callable[..., None]:
+def recorded(function: str) -> Callable[..., None] | None:
     """A function that does nothing and has the parameters and the docstring of that of a command.
 
     Args:
-        function: `MODULE:FUNCTION` below `amers.app.cli`.
+        function: `MODULE:FUNCTION` below `amers.app.cli`; None for one that the file has not.
     """
-    entry = _entries()[function]
+    entry = _entries().get(function)
+    if entry is None:
+        return None
 
     def shown(**given: Any) -> None:
         pass
