@@ -8,17 +8,27 @@ from datetime import timedelta
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import ColumnElement, Double, case, cast, func, select, update
+from sqlalchemy import (
+    ColumnElement,
+    Double,
+    Interval,
+    Select,
+    bindparam,
+    case,
+    cast,
+    func,
+    select,
+    update,
+)
 from sqlalchemy.dialects.postgresql import insert
 
 from amers.app.db.engine import Connection
 from amers.app.db.jobs.jobs import COLUMNS, Job
 from amers.app.db.jobs.queue import issue_ticket, lock_claims, replace_spent_ticket
-from amers.app.db.rows import among, every, only
+from amers.app.db.rows import among, every
 from amers.app.db.schema import clock, job, job_turn
 from amers.app.db.statements import named
 
-NEXT_JOB = named("jobs.sql", "next_job")
 DAY_S = 86_400.0
 LOST_WORKER = {"type": "lost-worker", "title": "The worker was lost"}
 
@@ -40,17 +50,22 @@ def claim_next(
         running_limit: most running jobs of one owner; None: no limit.
     """
     lock_claims(connection)
-    job_id = connection.scalar(NEXT_JOB, {"running_limit": running_limit})
-    if job_id is None:
-        return None
-    claimed = connection.execute(
+    values = {"running_limit": running_limit, "by": worker, "lease": timedelta(seconds=lease_s)}
+    claimed = every(Job, connection.execute(CLAIM, values))
+    return claimed[0] if claimed else None
+
+
+def _claim() -> Select[Any]:
+    """The statement of a claim, in one: other claims wait for every word that is exchanged about it."""
+    next_job = named("jobs.sql", "next_job").columns(job.c.id).cte("next_job")
+    claimed = (
         update(job)
-        .where(job.c.id == job_id)
+        .where(job.c.id == next_job.c.id)
         .values(
             state="running",
             attempt=job.c.attempt + 1,
-            worker=worker,
-            lease_until=clock + timedelta(seconds=lease_s),
+            worker=bindparam("by"),
+            lease_until=clock + bindparam("lease", type_=Interval),
             not_before=None,
             progress=0,
             message="started",
@@ -60,15 +75,18 @@ def claim_next(
             updated_at=clock,
         )
         .returning(*COLUMNS)
+        .cte("claimed")
     )
-    next_job = only(Job, claimed)
-    turn = insert(job_turn).values(owner=next_job.owner, claimed_at=next_job.claimed_at)
-    connection.execute(
-        turn.on_conflict_do_update(
-            index_elements=[job_turn.c.owner], set_={"claimed_at": turn.excluded.claimed_at}
-        )
+    turn = insert(job_turn).from_select(
+        [job_turn.c.owner, job_turn.c.claimed_at], select(claimed.c.owner, claimed.c.claimed_at)
     )
-    return next_job
+    of_owner = turn.on_conflict_do_update(
+        index_elements=[job_turn.c.owner], set_={"claimed_at": turn.excluded.claimed_at}
+    )
+    return select(claimed).add_cte(of_owner.returning(job_turn.c.owner).cte("turn"))
+
+
+CLAIM = _claim()
 
 
 def count_cpu(connection: Connection, owner: UUID | None, cpu_s: float, daily_s: float) -> None:
