@@ -28,6 +28,7 @@ class CheckedCommand(TyperCommand):
         Raises:
             UsageError: values are missing or wrong; its message is one sentence on all of them.
         """
+        ctx.default_map = self._defaults(ctx)
         given = list(args)
         try:
             return super().parse_args(ctx, args)
@@ -36,6 +37,16 @@ class CheckedCommand(TyperCommand):
         problems = list(dict.fromkeys(self._problems(ctx, given))) or [first.format_message()]
         ctx.fail("; ".join(problems))
         raise first
+
+    def _defaults(self, ctx: Any) -> dict[str, Any]:
+        """The values of the file of options, by the names of parameters."""
+        names = {_plain(option): one.name for one in self.params for option in one.opts}
+        defaults = {}
+        for name, value in (ctx.default_map or {}).items():
+            if name not in names:
+                ctx.fail(f"the file of --options has {name!r:.60}, and this command no such option")
+            defaults[names[name]] = value
+        return defaults
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command.
@@ -96,3 +107,8 @@ def _name(parameter: Any) -> str:
 def _listed(names: list[str]) -> str:
     """Names as a list in words."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _plain(option: str) -> str:
+    """The name of an option as a file has it."""
+    return option.strip("-").replace("-", "_")

@@ -286,5 +286,9 @@ COMMANDS: Tree = {
         "audit:audit",
         "Show the last changes of tokens, blocks, scenes, jobs and points, the newest first.",
     ),
+    "doctor": Command(
+        "doctor:doctor",
+        "Examine this installation: versions, database, storage, page, geoid grids, room; what to do.",
+    ),
 }
 """Groups and single commands in the order of the help; a test compares the lines with the docstrings."""

@@ -3,6 +3,7 @@
 import gc
 import signal
 import sys
+from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
 
@@ -45,12 +46,25 @@ def _show_version(asked: bool) -> None:
 
 @app.callback()
 def amers(
+    context: typer.Context,
     _version: Annotated[
         bool,
         typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version."),
     ] = False,
+    options: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.toml",
+            envvar="AMERS_OPTIONS",
+            help="File with options of commands, such as dem under [scene.register].",
+        ),
+    ] = None,
 ) -> None:
     """An open base of 3D ground control points, and the registration of satellite scenes on them."""
+    if options is not None:
+        from amers.app.cli.options_file import read_options  # most commands have none
+
+        context.default_map = read_options(options, COMMANDS)
 
 
 def main() -> None:

@@ -69,8 +69,8 @@ WITHOUT_STORE = {
     "store trash restore",
 }
 """Commands that work on files alone."""
-WITH_PROCESSES = {"demo", "serve", "worker"}
-"""Commands that run services, which outlive their sessions."""
+WITH_PROCESSES = {"demo", "serve", "worker", "doctor"}
+"""Commands that run services, which outlive their sessions, or whose result is what does not work."""
 
 
 @dataclass(frozen=True)
