@@ -224,7 +224,7 @@ def test_a_later_scene_of_10_m_is_registered_within_what_is_stated(archive, base
 
 def test_a_scene_of_2_m_is_brought_from_30_m_to_the_base(archive, base, tmp_path) -> None:
     block, made, _ = base
-    planned = ViewPlan("later-2m", CENTRE, (2000, 2000), 2.0, 12.0, 100.0)
+    planned = ViewPlan("later-2m", CENTRE, (2000, 2000), 2.0, 5.0, 100.0)
     view = simulate_view(archive.world, planned, np.random.default_rng(3), (24.0, -18.0))
     scene = tmp_path / "later-2m.tif"
     write_raster(scene, view.pixels, view.geometry.delivered)
