@@ -9,9 +9,14 @@ from typing import Literal
 
 from fastapi import APIRouter, Request, Response
 
+from amers.app.api.deps import CallerDep, DatabaseDep, SettingsDep
 from amers.app.api.negotiation import refuse_unknown
 from amers.app.api.pages import Page, document_page
 from amers.app.api.routes import CallerRoute
+from amers.app.auth import Scope, allows
+from amers.app.db.features.collection import Viewer
+from amers.app.db.points import POINTS
+from amers.app.usecases.features.items import extent
 
 router = APIRouter(include_in_schema=False, route_class=CallerRoute)
 
@@ -24,6 +29,10 @@ INTRODUCTION = (
 )
 EXAMPLE = "https://gcp.example.org"
 """The address of the service in the documentation."""
+Box = tuple[str, str, str, str]
+EXAMPLE_BOX: Box = ("5.22", "43.21", "5.27", "43.26")
+"""West, south, east, north in the lines, which the page replaces by a box that the service serves."""
+_SIDE_DEG = 0.05
 
 
 @dataclass(frozen=True)
@@ -38,9 +47,12 @@ class Lines:
     language: Literal["bash", "python", "text"]
     text: str
 
-    def at(self, base: str) -> str:
-        """The lines for the service at an address."""
-        return self.text.strip("\n").replace("BASE", base)
+    def at(self, base: str, box: Box = EXAMPLE_BOX) -> str:
+        """The lines for the service at an address, with a box."""
+        text = self.text.strip("\n").replace("BASE", base)
+        for between in (",", ", ", " "):
+            text = text.replace(between.join(EXAMPLE_BOX), between.join(box))
+        return text
 
 
 @dataclass(frozen=True)
@@ -209,12 +221,34 @@ for item in catalog.search(collections=["scenes"], bbox=[5.22, 43.21, 5.27, 43.2
 
 
 @router.get("/connect")
-def connect(request: Request) -> Response:
-    """Return the page, with the address at which the request has arrived."""
+def connect(
+    request: Request, database: DatabaseDep, settings: SettingsDep, caller: CallerDep
+) -> Response:
+    """Return the page, with the address at which the request has arrived, and a box with points."""
     refuse_unknown(request, set())
     page = Page(TITLE, INTRODUCTION)
     base = str(request.base_url).rstrip("/")
-    return document_page(request, page, "connect.html", recipes=RECIPES, address=base)
+    box = EXAMPLE_BOX
+    if settings.public_points or (caller is not None and allows(caller, Scope.READ)):
+        with database.reading() as connection:
+            box = _box_within(extent(connection, POINTS, Viewer()))
+    return document_page(request, page, "connect.html", recipes=RECIPES, address=base, box=box)
+
+
+def _box_within(served: tuple[float, ...] | None) -> Box:
+    """A small box in the middle of what is served; that of the documentation without any."""
+    if served is None:
+        return EXAMPLE_BOX
+    west, south, east, north = served
+    middle, half = ((west + east) / 2.0, (south + north) / 2.0), _SIDE_DEG / 2.0
+    sides = (
+        max(west, middle[0] - half),
+        max(south, middle[1] - half),
+        min(east, middle[0] + half),
+        min(north, middle[1] + half),
+    )
+    one, two, three, four = (f"{side:.4f}" for side in sides)
+    return one, two, three, four
 
 
 def as_markdown(base: str) -> str:

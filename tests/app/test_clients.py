@@ -5,10 +5,12 @@ They receive a token as in practice: GDAL by a setting, OWSLib by an argument. T
 """
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from html import unescape
 from pathlib import Path
 
 import geopandas
@@ -257,11 +259,24 @@ def test_the_page_connect_has_the_address_of_the_service(served):
         "frame-ancestors 'none'"
     )
     assert "BASE" not in reply.text
+    # Points are not public there: nothing tells where they are.
+    assert "bbox=5.22,43.21,5.27,43.26" in reply.text
     assert f"ogrinfo -so OAPIF:{served.url} points" in reply.text
     for recipe in RECIPES:
         assert f"<h2>{recipe.client}</h2>" in reply.text
     landing = httpx.get(f"{served.url}/").json()
     assert f"{served.url}/connect" in [link["href"] for link in landing["links"]]
+
+
+def test_the_lines_have_a_box_that_the_service_serves(served):
+    password = httpx.BasicAuth("anybody", served.authorization["Authorization"].split()[1])
+    reply = httpx.get(f"{served.url}/connect", auth=password)
+    (box,) = set(re.findall(r"bbox=([-\d.,]+)&", unescape(reply.text)))
+    assert box != "5.22,43.21,5.27,43.26"
+    for form in (box, box.replace(",", " "), box.replace(",", ", ")):
+        assert form in reply.text
+    items = f"{served.url}/collections/points/items"
+    assert httpx.get(items, params={"bbox": box}, auth=password).json()["numberMatched"] > 0
 
 
 @pytest.mark.long
