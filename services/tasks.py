@@ -113,7 +113,8 @@ class Work:
 
     def _keep_ended(self, pending: dict[Future[tuple[Arrays, float]], str]) -> int:
         ended = wait(pending, return_when=FIRST_COMPLETED).done
-        for future in ended:
+        # What has ended well is kept, whatever else has failed.
+        for future in sorted(ended, key=lambda future: future.exception() is not None):
             name = pending.pop(future)
             self.kept[name], cpu_s = future.result()
             stage = name.partition("/")[0]
