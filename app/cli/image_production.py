@@ -61,7 +61,7 @@ class ImageOptions:
             InputError: names what is wrong.
         """
         if bool(self.images) + (self.catalogue is not None) + (self.selection is not None) != 1:
-            raise InputError("one of --images, --catalogue and --selection is expected")
+            raise InputError("images, or one of --catalogue and --selection, are expected")
         absent = [image for image in self.images if "://" not in image and not Path(image).exists()]
         if absent:
             raise InputError(
@@ -106,6 +106,10 @@ class WorkOptions:
 
 
 def run(
+    given: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="IMAGES", help="Images with their models, as by --images."),
+    ] = None,
     *,
     images: ImageOptions,
     models: ModelChoice,
@@ -129,6 +133,7 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Make control points with chips from two or more overlapping images."""
+    images = replace(images, images=(*images.images, *(given or ())))
     images.check()
     fine_m, coarse_m = sampling_pair(gsd_m)
     control_files = control.files(neighbour)
