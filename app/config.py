@@ -241,3 +241,10 @@ def _shown(value: object) -> str:
     if not isinstance(value, str):
         return f"{value!r:.60}"
     return f"{SECRET_PARTS.sub('…', value)!r:.60}"
+
+
+def use_folder(folder: Path) -> None:
+    """Let this process and its children use the private database and the files of a data folder."""
+    for name in ("AMERS_DATABASE_URL", "AMERS_STORAGE_URL"):
+        os.environ.pop(name, None)
+    os.environ["AMERS_DATA_FOLDER"] = str(folder)

@@ -8,7 +8,6 @@ connections that wait to be accepted.
 import errno
 import ipaddress
 import logging
-import os
 import signal
 import socket
 import sys
@@ -22,7 +21,7 @@ import typer
 
 from amers.app import logs
 from amers.app.cli.supervisor import Child, Supervisor
-from amers.app.config import Settings, read_settings
+from amers.app.config import Settings, read_settings, use_folder
 from amers.app.db.cluster import embedded
 from amers.app.db.ready import ready_database
 from amers.app.errors import InputError, PortInUse
@@ -60,7 +59,7 @@ def serve(
     map, signed in; it serves until the command ends.
     """
     if data is not None:
-        _use_folder(data.absolute())
+        use_folder(data.absolute())
     settings = read_settings()
     logs.configure(settings)
     supervisor = Supervisor()
@@ -77,13 +76,6 @@ def serve(
             supervisor.run(_children(listeners, worker), at_stop=close.close)
     if supervisor.exit_code:
         raise typer.Exit(supervisor.exit_code)
-
-
-def _use_folder(folder: Path) -> None:
-    """Settings of a private database and its files in a folder, for this process and its children."""
-    for name in ("AMERS_DATABASE_URL", "AMERS_STORAGE_URL"):
-        os.environ.pop(name, None)
-    os.environ["AMERS_DATA_FOLDER"] = str(folder)
 
 
 def _is_loopback(listener: socket.socket) -> bool:

@@ -73,7 +73,7 @@ def test_the_words_say_of_what_part_of_the_image_they_speak(share: float, words:
 
 
 def test_the_words_on_the_earth_say_what_was_assumed():
-    frame = Frame(np.eye(3), assumed="nobody stated the accuracy of the models; give --sigma-m")
+    frame = Frame(np.eye(3), assumed="the accuracy of the models is not stated; give --sigma-m")
     stated = scene_accuracy(1.0, 3.0, frame, 100.0)
     assert "assumed" not in stated.relative_to_control_points.words
     assert stated.on_the_earth.words.endswith(f": assumed: {frame.assumed}")

@@ -232,7 +232,7 @@ def test_a_block_states_what_its_points_share(tmp_path):
 
 def test_a_block_says_what_its_frame_assumes(tmp_path):
     points = control_points(3, np.random.default_rng(1))
-    stated = Frame(np.eye(3), assumed="nobody stated the accuracy of two models")
+    stated = Frame(np.eye(3), assumed="the accuracy of two models is not stated")
     write_block(tmp_path / "block", replace(metadata(), frame=stated), points, noise_chips(points), {})
     (frame,) = check_block(tmp_path / "block").points.frames
     assert frame.assumed == stated.assumed
