@@ -28,7 +28,10 @@ class FeatureOptions:
 
     Attributes:
         per_image: number of features aimed at in an image, the strongest of each part of the ground.
-        per_megapixel: largest number of features per million pixels; it limits small images.
+        per_megapixel: largest number of features per million pixels of the image, for small ones.
+        reduced_px: pixels that an image keeps at least when it is reduced for its features.
+        most_reduced: largest reduction. The models that such features adjust are right to a pixel of the
+            image or two, within the reach of the search on chips.
         largest_px: largest diameter of a feature; larger ones cannot be located precisely.
         sigma_px: of the position of a feature, one standard deviation a coordinate, pixels of the ground
             sampling in which it was found.
@@ -36,8 +39,25 @@ class FeatureOptions:
 
     per_image: int = 12_000
     per_megapixel: int = 10_000
+    reduced_px: int = 250_000
+    most_reduced: float = 4.0
     largest_px: float = 5.0
     sigma_px: float = 0.3
+
+
+@dataclass(frozen=True)
+class GroundPatches:
+    """Squares of the ground in which features are found.
+
+    Attributes:
+        centres: (n, 3) lon, lat, h.
+        size_px: (2,) columns and rows, pixels of the ground sampling.
+        margin_px: ground around a square that descriptors may reach into.
+    """
+
+    centres: Array
+    size_px: Array
+    margin_px: int = _MARGIN_PX
 
 
 @dataclass(frozen=True)
@@ -65,7 +85,12 @@ class Features:
         return np.asarray(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-6))
 
 
-def find_features(scene: Scene, gsd_m: float, options: FeatureOptions = FeatureOptions()) -> Features:
+def find_features(
+    scene: Scene,
+    gsd_m: float,
+    options: FeatureOptions = FeatureOptions(),
+    patches: GroundPatches | None = None,
+) -> Features:
     """SIFT features of an image, found on the ground north up: the strongest of every part.
 
     All images show the ground at the same sampling and orientation, so that descriptors need not be
@@ -73,19 +98,21 @@ def find_features(scene: Scene, gsd_m: float, options: FeatureOptions = FeatureO
 
     Args:
         scene: the image and its model.
-        gsd_m: ground sampling, metres; that of the coarsest image of a block.
+        gsd_m: ground sampling, metres; that of the coarsest image of a block, or a larger one.
         options: number and size of features.
+        patches: parts of the ground that are searched; None searches all that the image shows.
     """
+    patches = patches or _covering(scene, gsd_m)
     lines, samples = scene.image.shape
     ratio = gsd_m / scene_gsd_m(scene)
-    per_pixel = min(options.per_megapixel / 1e6, options.per_image * ratio**2 / (lines * samples))
+    searched_px = min(lines * samples / ratio**2, len(patches.centres) * float(patches.size_px.prod()))
+    per_pixel = min(options.per_megapixel / 1e6 * ratio**2, options.per_image / max(searched_px, 1.0))
     positions, descriptors = [np.empty((0, 2))], [np.empty((0, 128), dtype=np.uint8)]
-    centres, size_px = _ground_squares(scene, gsd_m)
-    side = int(np.ceil(size_px.max())) + 2 * _MARGIN_PX | 1
-    for centre in centres:
+    side = int(np.ceil(patches.size_px.max())) + 2 * patches.margin_px | 1
+    for centre in patches.centres:
         tile = render_chip(scene.image, scene.model, centre, gsd_m, side)
         column_row, descriptor = _tile_features(tile, per_pixel, options.largest_px)
-        inside = (np.abs(column_row - side // 2) <= size_px / 2.0).all(axis=1)
+        inside = (np.abs(column_row - side // 2) <= patches.size_px / 2.0).all(axis=1)
         if inside.any():
             in_image = chip_positions(scene.model, centre, gsd_m, side)
             positions.append(_interpolated(in_image, column_row[inside]))
@@ -93,8 +120,8 @@ def find_features(scene: Scene, gsd_m: float, options: FeatureOptions = FeatureO
     return Features(np.concatenate(positions), np.concatenate(descriptors))
 
 
-def _ground_squares(scene: Scene, gsd_m: float) -> tuple[Array, Array]:
-    """Centres (n, 3) and size (2,), columns and rows in pixels, of parts that cover the ground."""
+def _covering(scene: Scene, gsd_m: float) -> GroundPatches:
+    """Squares that cover the ground of an image."""
     centre = scene_centre(scene)
     lines, samples = (np.linspace(-0.5, n - 0.5, _BORDER_NODES) for n in scene.image.shape)
     border = np.stack(np.meshgrid(lines, samples), axis=-1).reshape(-1, 2)
@@ -106,7 +133,7 @@ def _ground_squares(scene: Scene, gsd_m: float) -> tuple[Array, Array]:
     parts = np.stack(np.meshgrid(*(np.arange(n) for n in count)), axis=-1).reshape(-1, 2)
     enu = np.zeros((len(parts), 3))
     enu[:, :2] = low + (parts + 0.5) * size_m
-    return lon_lat_h_from_east_north_up(enu, centre), size_m / gsd_m
+    return GroundPatches(lon_lat_h_from_east_north_up(enu, centre), size_m / gsd_m)
 
 
 def _tile_features(

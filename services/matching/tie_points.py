@@ -219,13 +219,18 @@ def _descriptor_pairs(pair: _Pair, rows: IntArray, lines: _EpipolarLines, band: 
     positions, cell_px = pair.others.line_sample, pair.options.cell_px
     usable: BoolArray = np.asarray(np.isfinite(lines.expected).all(axis=1))
     cell = np.floor(np.where(usable[:, None], lines.expected, 0.0) / cell_px).astype(np.int64)
+    by_line = np.argsort(positions[:, 0], kind="stable")
+    ordered = positions[by_line, 0]
     reach_px = half_m * np.abs(lines.per_metre) + band.end_px + band.gate_px + abs(band.across_px)
     found = [Matches(np.empty((0, 2), dtype=np.int64), np.empty(0))]
     for key in np.unique(cell[usable], axis=0):
         mine = np.flatnonzero(usable & np.all(cell == key, axis=1))
         low = (lines.expected[mine] - reach_px[mine]).min(axis=0)
         high = (lines.expected[mine] + reach_px[mine]).max(axis=0)
-        theirs = np.flatnonzero(np.all((positions >= low) & (positions <= high), axis=1))
+        first, last = np.searchsorted(ordered, low[0]), np.searchsorted(ordered, high[0], "right")
+        theirs = np.sort(by_line[first:last])
+        sample = positions[theirs, 1]
+        theirs = theirs[(sample >= low[1]) & (sample <= high[1])]
         if len(theirs) < 2:
             continue
         across, along_m = lines.coordinates(mine[:, None], positions[theirs][None, :])

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from amers.services.types import Acquisition, Array, BoolArray
+from amers.services.types import Acquisition, Array, BoolArray, IntArray, Observations
 
 _LONGEST_PASS = timedelta(minutes=20)
 """A satellite sees a place for less than this from horizon to horizon, and next after a whole orbit."""
@@ -45,3 +45,13 @@ def _links(sensor: npt.NDArray[np.str_], time_s: Array) -> list[tuple[int, int]]
         may_be &= (sensor == "") | (sensor[i] == "") | (sensor == sensor[i])
         links += [(i, j) for j in np.flatnonzero(may_be).tolist()]
     return links
+
+
+def dates_of_points(shown: Observations, passes: Sequence[BoolArray], count: int) -> IntArray:
+    """Number (count,) of passes that show each point: what many dates show lasts longest."""
+    date = np.arange(1 + int(shown.image.max(initial=0)))
+    for members in passes:
+        own = np.flatnonzero(members)
+        date[own[own < len(date)]] = own[0]
+    seen = np.unique(np.column_stack([shown.point, date[shown.image]]), axis=0)
+    return np.bincount(seen[:, 0], minlength=count).astype(np.int64)

@@ -15,19 +15,21 @@ from amers.services.adjustment.observation_noise import found_noise
 from amers.services.adjustment.parameters import image_parameters
 from amers.services.conventions import CHIP_SIZE
 from amers.services.errors import InputError, NotEnoughPoints
-from amers.services.geodesy import box_around, continuous, east_north_up
+from amers.services.geodesy import box_around
 from amers.services.imagery.scene import Scene, scene_gsd_m
 from amers.services.matching.ground_features import FeatureOptions
 from amers.services.matching.multi_image import RefinementOptions, chip_inside
 from amers.services.matching.predict import rank_in_group
 from amers.services.production.block_residuals import ImageFit, PointFits, image_fits, point_fits
 from amers.services.production.control import Control, MeasuredPoints, with_control
+from amers.services.production.ground_cells import GroundGrid
 from amers.services.production.ground_parts import cut_points, measure_points
 from amers.services.production.height_control import ortho_heights
-from amers.services.production.image_passes import image_passes
+from amers.services.production.image_passes import dates_of_points, image_passes
+from amers.services.production.point_squares import point_squares, ties_in_squares
 from amers.services.production.point_surfaces import surfaces_at
 from amers.services.production.point_views import check_image_names, shows_chip
-from amers.services.production.tie_points import find_tie_points
+from amers.services.production.tie_points import find_tie_points, joined_ties
 from amers.services.quality.density import GroundMask
 from amers.services.statements import Statements
 from amers.services.tasks import Effort, Work
@@ -173,10 +175,7 @@ def produce_points(
     work = work or Work()
     passes = image_passes([scene.acquisition for scene in scenes])
     images = _Images(scenes, passes, options, control.neighbour)
-    ties = _ties(images, work, part_of(progress, 0.0, 0.5))
-    progress(0.5, "adjusting the block")
-    flat = joined_ground([ortho_heights(scenes, ties, heights) for heights in control.heights])
-    tied = images.adjusted(ties, flat)
+    ties, flat, tied = _tied(images, control, work, part_of(progress, 0.0, 0.5))
     candidates = _candidates(images.placed(tied), tied, ties, options, excluded)
     measured = _measured(images, tied, candidates, control, work=work, progress=progress)
     progress(0.8, "adjusting the block on its chips")
@@ -273,15 +272,31 @@ class _Images:
         return [replace(scene, model=model) for scene, model in pairs]
 
 
-def _ties(images: _Images, work: Work, progress: Progress) -> Observations:
-    """The tie points of the images."""
-    options = images.options
-    ties = find_tie_points(images.scenes, images.of_passes, options.features, work, progress)
+def _tied(
+    images: _Images, control: Control, work: Work, progress: Progress
+) -> tuple[Observations, ControlGround, BlockAdjustment]:
+    """Tie points, the known heights of some, and the adjustment of the block on both."""
+
+    def adjusted(ties: Observations) -> tuple[ControlGround, BlockAdjustment]:
+        flat = joined_ground([ortho_heights(images.scenes, ties, one) for one in control.heights])
+        return flat, images.adjusted(ties, flat)
+
+    options, passes = images.options, images.of_passes
+    first = part_of(progress, 0.0, 0.5)
+    ties = find_tie_points(images.scenes, passes, options.features, work, first)
     if len(ties) == 0:
-        raise NotEnoughPoints(
-            0, options.block.min_points, "tie points: the images have nothing in common"
-        )
-    return ties
+        why = "tie points: the images have nothing in common"
+        raise NotEnoughPoints(0, options.block.min_points, why)
+    progress(0.5, "adjusting the block")
+    flat, tied = adjusted(ties)
+    ground = tied.lon_lat_h[np.isfinite(tied.lon_lat_h[:, 0])]
+    squares, second = _grid(ground, options), part_of(progress, 0.5, 0.5)
+    scenes, features = images.placed(tied), options.features
+    more = ties_in_squares(scenes, passes, squares, ground, features, work=work, progress=second)
+    if len(more):
+        ties = joined_ties(ties, more)
+        flat, tied = adjusted(ties)
+    return ties, flat, tied
 
 
 def _measured(
@@ -343,7 +358,7 @@ def _chosen(
     saliency = np.append(measured.saliency, np.zeros(len(measured.known)))[: len(adjustment.lon_lat_h)]
     if excluded is not None:
         saliency[excluded(adjustment.lon_lat_h[:, :2])] = 0.0
-    dates = _dates(shown, images.of_passes, len(saliency))
+    dates = dates_of_points(shown, images.of_passes, len(saliency))
     rows = _select_points(adjustment, saliency, shown, dates, options)
     shown = shown.take(np.isin(shown.point, rows))
     return _Chosen(rows, saliency[rows], replace(shown, point=np.searchsorted(rows, shown.point)))
@@ -423,14 +438,11 @@ def _precise(sigma_m: Array, options: ProductionOptions) -> BoolArray:
 
 def _squares(lon_lat_h: Array, options: ProductionOptions) -> IntArray:
     """Number (n,) of the square of ground that every point (n, 3) lies in."""
-    enu = east_north_up(lon_lat_h, np.median(continuous(lon_lat_h), axis=0))[:, :2]
-    if options.spacing_m is not None:
-        side = options.spacing_m
-    else:
-        extent = np.ptp(enu, axis=0) + 1.0
-        side = float(np.sqrt(extent[0] * extent[1] / options.points))
-    cell = np.floor(enu / side).astype(np.int64)
-    return np.unique(cell, axis=0, return_inverse=True)[1].astype(np.int64)
+    return _grid(lon_lat_h, options).cell_of(lon_lat_h[:, :2])
+
+
+def _grid(lon_lat_h: Array, options: ProductionOptions) -> GroundGrid:
+    return point_squares(lon_lat_h, options.spacing_m, options.points)
 
 
 def _select_points(
@@ -456,16 +468,6 @@ def _select_points(
         )
     square = _squares(points.lon_lat_h[rows], options)
     return rows[rank_in_group(square, dates[rows] + views[rows] + saliency[rows]) == 0]
-
-
-def _dates(shown: Observations, passes: Sequence[BoolArray], count: int) -> IntArray:
-    """Number (count,) of passes that show each point: what many dates show lasts longest."""
-    date = np.arange(1 + int(shown.image.max(initial=0)))
-    for members in passes:
-        own = np.flatnonzero(members)
-        date[own[own < len(date)]] = own[0]
-    seen = np.unique(np.column_stack([shown.point, date[shown.image]]), axis=0)
-    return np.bincount(seen[:, 0], minlength=count).astype(np.int64)
 
 
 def _cut_out(
