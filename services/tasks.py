@@ -75,19 +75,19 @@ class Work:
             progress: receives the fraction done.
         """
         pending: dict[Future[tuple[Arrays, float]], str] = {}
-        done = 0
+        course, done = _Course(len(tasks)), 0
         try:
             for name, arguments in tasks:
                 if name not in self.kept:
                     pending[self.executor.submit(_measured, function, arguments())] = name
                 else:
-                    done += 1
+                    course, done = replace(course, kept=course.kept + 1), done + 1
                 if len(pending) >= self.ahead:
                     done += self._keep_ended(pending)
-                progress(done / len(tasks), f"{name.partition('/')[0]}: {done} of {len(tasks)}")
+                progress(done / len(tasks), course.words(name, done))
             while pending:
                 done += self._keep_ended(pending)
-                progress(done / len(tasks), f"{name.partition('/')[0]}: {done} of {len(tasks)}")
+                progress(done / len(tasks), course.words(name, done))
         finally:
             for future in pending:
                 future.cancel()
@@ -121,6 +121,30 @@ class Work:
             before = self.effort.get(stage, Effort())
             self.effort[stage] = Effort(before.tasks + 1, before.cpu_s + cpu_s)
         return len(ended)
+
+
+@dataclass(frozen=True)
+class _Course:
+    """The tasks of one run: their number, those kept from before, and when the run began."""
+
+    count: int
+    kept: int = 0
+    begun_s: float = field(default_factory=time.monotonic)
+
+    def words(self, name: str, done: int) -> str:
+        """How many tasks are done, and how long the rest takes at the rate so far."""
+        words = f"{name.partition('/')[0]}: {done} of {self.count}"
+        computed = done - self.kept
+        if computed == 0 or done == self.count:
+            return words
+        left_s = (time.monotonic() - self.begun_s) / computed * (self.count - done)
+        return f"{words}, {_duration(left_s)} left"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 100.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 6000.0 else f"{seconds / 3600.0:.0f} h"
 
 
 def _measured(function: Callable[..., Arrays], arguments: tuple[Any, ...]) -> tuple[Arrays, float]:

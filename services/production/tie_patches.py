@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from amers.services.geodesy import ecef_from_lon_lat_h
 from amers.services.imagery.scene import Scene, scene_centre, scene_footprint, scene_gsd_m
-from amers.services.matching.ground_features import GroundPatches
+from amers.services.matching.ground_features import FeatureOptions, GroundPatches
 from amers.services.production.ground_cells import GroundGrid, ground_grid, seen_cells
 from amers.services.types import Array, IntArray
 
@@ -54,6 +54,36 @@ def sparse_patches(scenes: Sequence[Scene], gsd_m: float) -> list[GroundPatches 
 def reduced_pixels(scene: Scene, gsd_m: float) -> float:
     """Pixels of an image at a ground sampling."""
     return scene.image.shape[0] * scene.image.shape[1] * (scene_gsd_m(scene) / gsd_m) ** 2
+
+
+def searched_pixels(
+    pixels: float, smallest: float, squares: float, options: FeatureOptions
+) -> tuple[float, float]:
+    """Pixels in which features of one image are found, and pixels of the image that are read for them.
+
+    Args:
+        pixels: of the image.
+        smallest: pixels of the smallest image of the block.
+        squares: places in the image where a point is wanted.
+        options: of the features.
+    """
+    reduction = reduction_of(smallest, options)
+    reduced = pixels / reduction**2
+    if reduced > _WHOLE_PX:
+        margin_px = GroundPatches.margin_px
+        first = _PATCHES_A_SIDE**2 * (_PATCH_PX + 2 * margin_px) ** 2
+        reduced = min(reduced, first + squares * (_DETAIL_PX + 2 * _DETAIL_MARGIN_PX) ** 2)
+    return reduced, reduced * reduction**2
+
+
+def reduction_of(smallest: float, options: FeatureOptions) -> float:
+    """How many times coarser than its pixels the smallest image of a block is searched at first.
+
+    Args:
+        smallest: its pixels.
+        options: of the features.
+    """
+    return float(np.clip(np.sqrt(smallest / options.reduced_px), 1.0, options.most_reduced))
 
 
 def is_searched_in_patches(scenes: Sequence[Scene], gsd_m: float) -> bool:

@@ -17,7 +17,7 @@ from amers.services.matching.ground_features import (
 from amers.services.matching.tie_points import Matches, match_features
 from amers.services.matching.tracks import image_cells, spread_tracks, tracks
 from amers.services.production.image_pairs import image_pairs
-from amers.services.production.tie_patches import sparse_patches
+from amers.services.production.tie_patches import reduction_of, sparse_patches
 from amers.services.tasks import Arrays, Work
 from amers.services.types import Array, BoolArray, IntArray, Observations, Progress, part_of
 
@@ -104,7 +104,7 @@ def find_tie_points(
 def feature_reduction(scenes: Sequence[Scene], options: FeatureOptions) -> float:
     """How many times coarser than the coarsest image features are looked for at first."""
     smallest = min(scene.image.shape[0] * scene.image.shape[1] for scene in scenes)
-    return float(np.clip(np.sqrt(smallest / options.reduced_px), 1.0, options.most_reduced))
+    return reduction_of(smallest, options)
 
 
 def no_ties() -> Observations:

@@ -5,6 +5,7 @@ from datetime import datetime
 from typing import Any
 
 from amers.services.production.block_plan import BlockPlan
+from amers.services.production.cost import ProductionCost, production_cost
 from amers.services.production.planning import Accuracy90, Forecast
 
 FORMAT = "amers-plan/1"
@@ -32,6 +33,13 @@ class PlanReport:
     software_version: str
 
     @property
+    def cost(self) -> ProductionCost:
+        """Of a block with a point in each square of the plan's spacing."""
+        spacing_m = self.plan.spacing_m
+        area_km2 = len(self.forecast.lon_lat) * spacing_m**2 / 1e6
+        return production_cost(self.plan.images, area_km2, spacing_m)
+
+    @property
     def words(self) -> tuple[str, ...]:
         """The accuracy and the proposals as sentences."""
         found = self.forecast
@@ -48,7 +56,7 @@ class PlanReport:
                 f"LE90 {one.on_the_earth.le90_m:.2f} m"
             )
             before = one.on_the_earth.ce90_m
-        return tuple(lines)
+        return (*lines, self.cost.words)
 
     def document(self) -> dict[str, Any]:
         """Members of the JSON document."""
@@ -58,6 +66,7 @@ class PlanReport:
             "block": {"id": self.name},
             "verdict": VERDICT,
             "plan": self.plan,
+            "cost": self.cost,
             "points": len(found.lon_lat),
             "groups": found.groups,
             "relative_to_control_points": found.relative,

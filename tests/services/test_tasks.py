@@ -28,6 +28,19 @@ def test_results_are_kept_by_name_and_progress_reaches_the_end() -> None:
     assert [fraction for fraction, _ in seen] == sorted(fraction for fraction, _ in seen)
 
 
+def test_progress_says_how_long_the_rest_takes_at_the_rate_of_computed_tasks() -> None:
+    work, seen = Work(kept={"busy/0": {}}), []
+    work.run(
+        busy, [(f"busy/{i}", partial(tuple, [0.3])) for i in range(12)], lambda _, m: seen.append(m)
+    )
+    left = [message.partition(", ")[2] for message in seen]
+    assert left[0] == ""
+    assert seen[-1] == "busy: 12 of 12"
+    first_s = float(next(words for words in left if words).split()[0])
+    # Eleven are computed, ten after the first one: of 0.3 s on a free machine.
+    assert first_s >= 2.0
+
+
 def test_what_is_kept_is_not_computed_again() -> None:
     work = Work()
     work.kept["doubled/1"] = {"value": np.array([99])}
