@@ -145,7 +145,8 @@ def test_a_worker_that_is_killed_in_the_middle_changes_nothing(images, alone, tm
         killed = []
 
         def kill_one(fraction: float, message: str) -> None:
-            if message.startswith("measures: 1 ") and not killed:
+            # Several tasks may end between two messages: the first one comes while some are computed.
+            if message.startswith("measures: ") and not killed:
                 os.kill(cluster.workers[0].pid, signal.SIGKILL)
                 killed.append(message)
 
