@@ -7,6 +7,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand
 
+from amers.app.cli.examples import epilogue
 from amers.app.cli.exit_status import is_refusal
 
 INPUT = re.compile(r"^[a-z_]+(?=: )|(?<=`)[a-z_]+(?=`)")
@@ -47,6 +48,12 @@ class CheckedCommand(TyperCommand):
                 ctx.fail(f"the file of --options has {name!r:.60}, and this command no such option")
             defaults[names[name]] = value
         return defaults
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help, which ends with examples."""
+        _, _, command = ctx.command_path.partition(" ")
+        self.epilog = epilogue(command)
+        super().format_help(ctx, formatter)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command.
