@@ -81,10 +81,15 @@ def affine_start(
         raise NotEnoughPoints(int(usable.sum()), min_points, "measures with a position and a sigma")
     order, validation_px = _order(declared, usable, options, like)
     free = FREE[order]
-    fit = declared.with_empirical_variance(declared.robust_solution(usable, free), usable, of_points)
+    stated = (
+        np.zeros(len(usable), dtype=np.bool_) if observations.stated is None else observations.stated
+    )
+    shown = usable & ~stated if (usable & ~stated).any() else usable
+    fit = declared.with_empirical_variance(declared.robust_solution(usable, free), shown, of_points)
     parameters = fit.robust_solution(usable, free)
     scale = fit.scale(parameters, usable, free)
-    agreeing = usable & (fit.magnitude(parameters) / scale <= 2.0 * options.tolerance)
+    scales = np.where(stated, max(scale, 1.0), scale)
+    agreeing = usable & (fit.magnitude(parameters) / scales <= 2.0 * options.tolerance)
     unit, slope_px = max(scale, 1.0), float("inf")
     if options.order is None:
         free = FREE["affine"]
@@ -100,7 +105,7 @@ def affine_start(
         )
         fit, declared = (replace(one, offset_px=offset_px) for one in (fit, declared))
     # The scale is that of the robust start: a scale of the active measures would shrink with them.
-    magnitude = partial(_magnitude, fit=fit, free=free, slope_px=slope_px, scale=scale)
+    magnitude = partial(_magnitude, fit=fit, free=free, slope_px=slope_px, scales=scales)
     return AffineStart(
         declared=declared,
         fit=fit,
@@ -120,11 +125,11 @@ def affine_start(
 
 
 def _magnitude(
-    active: BoolArray, *, fit: AffineFit, free: BoolArray, slope_px: float, scale: float
+    active: BoolArray, *, fit: AffineFit, free: BoolArray, slope_px: float, scales: Array
 ) -> Array:
     """The larger normalised residual (n,) of each measure from the solution of the active ones."""
     parameters, _ = fit.solution(active, free, slope_px)
-    return np.asarray(fit.magnitude(parameters) / scale)
+    return np.asarray(fit.magnitude(parameters) / scales)
 
 
 def _order(

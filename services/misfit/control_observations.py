@@ -24,6 +24,8 @@ class ControlObservations:
         sigma_px: (n,) of the measures.
         covariance_m2: (n, 3, 3) of the points, east, north, up.
         usable: (n,) measures that may be used; all finite measures when None.
+        stated: (n,) measures whose sigma a person states, marks: they are not wrong where others are
+            more precise than declared. None for none.
         common_covariance_px2: (2, 2) line, sample, of an error that all measures share; it adds to the
             covariance of the shift. None when there is no such error.
         deformation_px2: (2, 2) line, sample, of what the blocks of the points are deformed by. None when
@@ -41,6 +43,7 @@ class ControlObservations:
     sigma_px: Array
     covariance_m2: Array
     usable: BoolArray | None = None
+    stated: BoolArray | None = None
     common_covariance_px2: Array | None = None
     deformation_px2: Array | None = None
     block: IntArray | None = None

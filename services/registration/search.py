@@ -139,6 +139,7 @@ def control_observations(scene: Scene, search: Search, usable: BoolArray) -> Con
         sigma_px=matches.sigma_px,
         covariance_m2=search.points.covariance_m2,
         usable=usable,
+        stated=search.points.id < 0,
         common_covariance_px2=ground_to_px @ matches.common_covariance_m2 @ ground_to_px.T,
         deformation_px2=derivative @ shared_m2 @ derivative.T,
         block=search.points.block,

@@ -95,6 +95,8 @@ def with_shares(
 ) -> tuple[BlockUsed, ...]:
     """The blocks of control points with how many points each gave to a registration, and how accurate.
 
+    Of a source whose points are not among these, such as marks of several scenes, nothing is counted.
+
     Args:
         blocks: in the order of the points' blocks.
         points: of all blocks.
@@ -103,6 +105,9 @@ def with_shares(
     shared = []
     for number, block in enumerate(blocks):
         ids = points.id[points.block == number]
+        if len(ids) == 0:
+            shared.append(block)
+            continue
         active = np.isin(points.id, measures.point_id[measures.active]) & (points.block == number)
         variance_m2 = points.covariance_m2[active][:, [0, 1], [0, 1]].mean(axis=1)
         shared.append(

@@ -44,8 +44,6 @@ from tests.factories import make_block
 Words = tuple[object, ...]
 BOX = ",".join(f"{value:.4f}" for value in (*(CENTRE - 0.1), *(CENTRE + 0.1)))
 WITHOUT_STORE = {
-    "base make",
-    "base update",
     "scene mosaic",
     "points experiment",
     "points intersect",
@@ -69,6 +67,8 @@ WITHOUT_STORE = {
     "store trash restore",
 }
 """Commands that work on files alone."""
+ON_REQUEST = {"base make", "base update"}
+"""Commands that open the store where `--publish` asks for it; `tests/app/test_base.py` has these."""
 WITH_PROCESSES = {"demo", "serve", "worker", "doctor"}
 """Commands that run services, which outlive their sessions, or whose result is what does not work."""
 

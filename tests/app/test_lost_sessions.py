@@ -28,6 +28,7 @@ from amers.app.usecases.blocks import deletion
 from tests.app.conftest import EMPTY_TEMPLATE, TEMPLATE
 from tests.app.session_relay import Ending, Relay, relayed
 from tests.app.store_commands import (
+    ON_REQUEST,
     STORE_COMMANDS,
     WITH_PROCESSES,
     WITHOUT_STORE,
@@ -186,7 +187,7 @@ def drawn(command: str, ending: Ending, n_statements: int, count: int) -> list[i
 
 
 def test_every_command_is_tried_or_works_without_the_store():
-    tried = (*STORE_COMMANDS, *WITHOUT_STORE, *WITH_PROCESSES)
+    tried = (*STORE_COMMANDS, *WITHOUT_STORE, *ON_REQUEST, *WITH_PROCESSES)
     assert sorted(tried) == sorted(all_commands())
 
 

@@ -6,8 +6,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from amers.services.production.image_passes import image_passes
-from amers.services.production.image_production import _dates
+from amers.services.production.image_passes import dates_of_points, image_passes
 from amers.services.types import Acquisition, Observations
 
 START = datetime(2024, 5, 1, 10, tzinfo=UTC)
@@ -68,4 +67,4 @@ def test_points_of_more_dates_count_more() -> None:
         sigma_px=np.ones(6),
     )
     # Images 0, 1 and 2 are of one pass.
-    assert _dates(shown, [np.array([True, True, True, False])], 3).tolist() == [1, 2, 0]
+    assert dates_of_points(shown, [np.array([True, True, True, False])], 3).tolist() == [1, 2, 0]

@@ -66,12 +66,13 @@ def plan() -> PlanReport:
 def test_a_plan_states_its_accuracy_relative_first_and_what_each_further_site_gains(
     plan: PlanReport,
 ) -> None:
-    relative, earth, first, second = plan.words
+    relative, earth, first, second, cost = plan.words
     assert relative.startswith("Relative to the control points: CE90 1.10 m, LE90 1.20 m on average")
     assert relative.endswith("worst place 1.30 m, 1.40 m")
     assert earth.startswith("On the Earth: CE90 5.10 m, LE90 5.20 m on average")
     assert "far (6.5000, 43.7500): mean CE90 on the Earth 5.10 m to 4.00 m, LE90 4.10 m" in first
     assert "near (5.5000, 43.2500): mean CE90 on the Earth 4.00 m to 3.50 m, LE90 3.60 m" in second
+    assert "core-hours" in cost
 
 
 def test_the_document_of_a_plan_names_what_each_candidate_gains(plan: PlanReport) -> None:

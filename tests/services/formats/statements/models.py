@@ -372,6 +372,16 @@ def geom_of_a_sensor(folder: Path) -> Scene:
     return beside(folder, "a.geom", geom + "sensor: GeoEye-1\n")
 
 
+@cell(
+    RIGOROUS,
+    Subject.MODEL,
+    "named",
+    "METADATA.DIM: sensor model: parameters of orbit and attitude: not used",
+)
+def spot_through_its_rpc(folder: Path) -> Scene:
+    return spot_by_its_delivered_names(folder)
+
+
 @cell(RIGOROUS, Subject.MODEL, "used", "METADATA.DIM: sensor model: rigorous model: used")
 def spot_by_its_delivered_names(folder: Path) -> Scene:
     write(folder / "METADATA.DIM", simulated.spot5_dimap(simulated.truth()))
