@@ -237,7 +237,8 @@ def _ties(measured: Sequence[MeasuredScene], work: Work, progress: Progress) -> 
         for one in measured
     ]
     passes = image_passes([scene.acquisition for scene in scenes])
-    return find_tie_points(scenes, passes, FeatureOptions(), work, progress)
+    # Their measures are ties themselves: nothing measures them again on finer pixels.
+    return find_tie_points(scenes, passes, FeatureOptions(most_reduced=1.0), work, progress)
 
 
 def _searched_again(

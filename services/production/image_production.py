@@ -29,7 +29,7 @@ from amers.services.production.image_passes import dates_of_points, image_passes
 from amers.services.production.point_squares import point_squares, ties_in_squares
 from amers.services.production.point_surfaces import surfaces_at
 from amers.services.production.point_views import check_image_names, shows_chip
-from amers.services.production.tie_points import find_tie_points, joined_ties
+from amers.services.production.tie_points import features_for_chips, find_tie_points, joined_ties
 from amers.services.quality.density import GroundMask
 from amers.services.statements import Statements
 from amers.services.tasks import Effort, Work
@@ -282,8 +282,8 @@ def _tied(
         return flat, images.adjusted(ties, flat)
 
     options, passes = images.options, images.of_passes
-    first = part_of(progress, 0.0, 0.5)
-    ties = find_tie_points(images.scenes, passes, options.features, work, first)
+    features = features_for_chips(images.scenes, options.features, options.fine_gsd_m)
+    ties = find_tie_points(images.scenes, passes, features, work, part_of(progress, 0.0, 0.5))
     if len(ties) == 0:
         why = "tie points: the images have nothing in common"
         raise NotEnoughPoints(0, options.block.min_points, why)
@@ -291,7 +291,7 @@ def _tied(
     flat, tied = adjusted(ties)
     ground = tied.lon_lat_h[np.isfinite(tied.lon_lat_h[:, 0])]
     squares, second = _grid(ground, options), part_of(progress, 0.5, 0.5)
-    scenes, features = images.placed(tied), options.features
+    scenes = images.placed(tied)
     more = ties_in_squares(scenes, passes, squares, ground, features, work=work, progress=second)
     if len(more):
         ties = joined_ties(ties, more)

@@ -36,7 +36,9 @@ def assert_registered(folder: Path, world: FlatWorld) -> None:
     """Check that the report follows its schema and that the refined model is right."""
     report = json.loads((folder / "report.json").read_text())
     validate(report, report_schema())
-    assert report["run"]["blocks"] == [{"id": "flat", "version": "1"}]
+    (only,) = report["run"]["blocks"]
+    assert (only["id"], only["version"]) == ("flat", "1")
+    assert only["active"] == report["point_counts"]["active"]
     refined = read_rpc(world.image, folder / "refined_RPC.TXT").model
     assert largest_error_px(refined, world.true_model) < A_TENTH_OF_A_PIXEL
     assert_exchanged(folder, report["point_counts"]["active"])
