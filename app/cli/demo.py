@@ -1,6 +1,8 @@
 """`amers demo`: the whole work on a simulated world, with nothing to configure."""
 
+import os
 import shutil
+import tempfile
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +17,7 @@ from amers.services.quality.accuracy_statement import accuracy_document
 from amers.services.quality.criteria import verdict_scope
 from amers.services.types import Array
 
-MARK = ".amers-demo"
+MARK, STORE = ".amers-demo", "store"
 NEXT = """
 Report: {report}
 
@@ -32,8 +34,7 @@ def demo(
 ) -> None:
     """Run the whole work on a simulated world: images, block, store, registration, report."""
     folder = _empty_folder(output)
-    store = folder.absolute() / "store"
-    store.mkdir(mode=0o711)
+    store = _make_store(folder)
     with shown_progress() as progress:
         outcome = run_demo(folder, Settings(database_url=None, data_folder=store), progress)
     if as_json:
@@ -50,10 +51,28 @@ def _empty_folder(folder: Path) -> Path:
             raise InputError(
                 f"--output: {folder} has files of something else than the demonstration; choose another"
             )
+        if (folder / STORE).is_symlink():
+            shutil.rmtree((folder / STORE).resolve(), ignore_errors=True)
         shutil.rmtree(folder)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / MARK).touch()
     return folder
+
+
+def _make_store(folder: Path) -> Path:
+    """The data folder of the demonstration, for it must not mix with real points.
+
+    Started by root, the database server runs as another user, who has to enter the folder: where that
+    user cannot enter the outputs, the store lies among temporary files, and a link leads to it.
+    """
+    store = folder.resolve() / STORE
+    if os.getuid() != 0 or all(one.stat().st_mode & 0o001 for one in store.parents):
+        store.mkdir(mode=0o711)
+        return store
+    elsewhere = Path(tempfile.mkdtemp(prefix="amers-demo-"))
+    elsewhere.chmod(0o711)
+    store.symlink_to(elsewhere)
+    return elsewhere
 
 
 LABELS = {

@@ -59,7 +59,7 @@ def serve(
     map, signed in; it serves until the command ends.
     """
     if data is not None:
-        use_folder(data.absolute())
+        use_folder(data.resolve())
     settings = read_settings()
     logs.configure(settings)
     supervisor = Supervisor()
