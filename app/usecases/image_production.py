@@ -159,8 +159,8 @@ def _with_what_was_assumed(production: Production, scenes: Sequence[Scene]) -> P
     if unstated == 0:
         return production
     assumed = (
-        f"the accuracy of the models of {unstated} of {len(scenes)} images is not stated and was taken "
-        f"as {UNKNOWN_SIGMA_M:g} m; state it with --sigma-m, or give --control"
+        f"{UNKNOWN_SIGMA_M:g} m for the models of {unstated} of {len(scenes)} images, which state none; "
+        "give --sigma-m or --control"
     )
     [frame] = production.points.frames
     points = replace(production.points, frames=(replace(frame, assumed=assumed),))

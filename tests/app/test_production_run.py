@@ -275,8 +275,7 @@ def test_a_block_of_images_that_state_no_accuracy_says_that_it_was_assumed(image
     run_image_production(replace(images, sigma_m=None), folder, BlockIdentity("unstated"), OPTIONS)
     (frame,) = read_block(folder).points.frames
     assert frame.assumed == (
-        "the accuracy of the models of 3 of 3 images is not stated and was taken as 50 m; state it with "
-        "--sigma-m, or give --control"
+        "50 m for the models of 3 of 3 images, which state none; give --sigma-m or --control"
     )
     report = json.loads((tmp_path / "block.adjustment" / "report.json").read_text())
     assert report["on_the_earth"]["words"].endswith(f": assumed: {frame.assumed}")

@@ -289,7 +289,9 @@ def record_registration(
         connection,
         job_id=job_id,
         scene_id=scene_id,
-        block_versions=document["run"]["blocks"],
+        block_versions=[
+            {"id": one["id"], "version": one["version"]} for one in document["run"]["blocks"]
+        ],
         options=document["run"]["options"],
         report=document,
         verdict=registered.registration.qualification.verdict,
