@@ -169,7 +169,7 @@ def test_residuals_are_found_minus_computed(name: str) -> None:
     np.testing.assert_allclose(
         measures.residual_px[matched],
         (measures.line_sample - computed)[matched],
-        atol=a_micropixel if is_affine else 1e-4,
+        atol=a_micropixel if is_affine else 2e-3,
     )
     np.testing.assert_allclose(
         measures.predicted, view_of(name).geometry.delivered.project(measures.lon_lat_h)
@@ -177,7 +177,7 @@ def test_residuals_are_found_minus_computed(name: str) -> None:
     # On the ground: moved by its residual, a point is computed where it was found.
     moved_m = np.column_stack([measures.residual_m, np.zeros(len(matched))])[matched]
     moved = result.model.project(measures.lon_lat_h[matched] + moved_m / per_degree())
-    np.testing.assert_allclose(moved, measures.line_sample[matched], atol=1e-3)
+    np.testing.assert_allclose(moved, measures.line_sample[matched], atol=1e-3 if is_affine else 3e-3)
 
 
 @names
