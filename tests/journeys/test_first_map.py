@@ -119,4 +119,5 @@ def test_elsewhere_the_address_signs_nobody_in(terminal: Terminal, browser: Brow
     expect(page.locator("h1").first).to_be_visible()
     expect(page.locator("#access")).not_to_have_text("amers serve")
     assert page.evaluate("sessionStorage.length") == 0
+    page.unroute_all(behavior="ignoreErrors")
     page.close()
