@@ -17,7 +17,7 @@ from amers.services.quality.accuracy_statement import accuracy_document
 from amers.services.quality.criteria import verdict_scope
 from amers.services.types import Array
 
-MARK, STORE = ".amers-demo", "store"
+MARK, STORE, ELSEWHERE = ".amers-demo", "store", "amers-demo-"
 NEXT = """
 Report: {report}
 
@@ -51,8 +51,10 @@ def _empty_folder(folder: Path) -> Path:
             raise InputError(
                 f"--output: {folder} has files of something else than the demonstration; choose another"
             )
-        if (folder / STORE).is_symlink():
-            shutil.rmtree((folder / STORE).resolve(), ignore_errors=True)
+        # Only what a demonstration made there: the link may lead elsewhere by now.
+        store = (folder / STORE).resolve()
+        if store.parent == Path(tempfile.gettempdir()).resolve() and store.name.startswith(ELSEWHERE):
+            shutil.rmtree(store, ignore_errors=True)
         shutil.rmtree(folder)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / MARK).touch()
@@ -69,7 +71,7 @@ def _make_store(folder: Path) -> Path:
     if os.getuid() != 0 or all(one.stat().st_mode & 0o001 for one in store.parents):
         store.mkdir(mode=0o711)
         return store
-    elsewhere = Path(tempfile.mkdtemp(prefix="amers-demo-"))
+    elsewhere = Path(tempfile.mkdtemp(prefix=ELSEWHERE))
     elsewhere.chmod(0o711)
     store.symlink_to(elsewhere)
     return elsewhere

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from uuid import uuid4
 
 from amers.app.auth import Scope
 from amers.app.db import engine
@@ -10,7 +11,6 @@ from amers.app.db.jobs.jobs import JobFilter
 from amers.app.errors import NotFound
 from amers.app.usecases.tokens import create_token, revoke_token
 
-_NAME = "amers serve"
 _DAYS = 1
 """How long the token is valid where its end is not reached, after a power cut."""
 
@@ -26,10 +26,9 @@ def signed_in_address(database_url: str, service_url: str) -> Iterator[str]:
         database_url: of the private database of this machine.
         service_url: such as `http://127.0.0.1:8000`.
     """
+    name = f"amers serve {uuid4().hex[:8]}"
     with engine.connect(database_url) as connection:
-        with suppress(NotFound):
-            revoke_token(connection, _NAME)
-        made = create_token(connection, _NAME, [Scope.ADMIN], _DAYS)
+        made = create_token(connection, name, [Scope.ADMIN], _DAYS)
         wanted = JobFilter(kinds=("register-scene",), states=("successful",))
         newest = jobs.newest(connection, None, wanted, 1)
     place = f"/job/{newest[0].id}/map" if newest else "/points"
