@@ -93,7 +93,7 @@ class Frame:
             deformations, by the errors of its images. It is part of the covariance of every point; zero
             where it is not stated.
         how_to_state: what a user gives to state it; "" where nothing can be given.
-        assumed: what it follows from that nobody stated, and what would state it; "" without anything.
+        assumed: values that it follows from and no file states, with the options for them; "" for none.
     """
 
     covariance_m2: Array

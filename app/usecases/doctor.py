@@ -73,11 +73,17 @@ def _machine() -> Finding:
 
 
 def _database(settings: Settings) -> Iterator[Finding]:
-    """The database and what only it can tell; a private one runs as long as this takes."""
+    """The database and the parts that are examined through it; a private one runs meanwhile."""
     try:
         if settings.database_url is None:
             binaries = find_binaries()
             yield Finding("PostgreSQL", "ok", f"version {binaries.version} in {binaries.folder}")
+            if not (settings.data_folder / "postgres").exists():
+                where = settings.data_folder
+                yield Finding(
+                    "database", "ok", f"none in {where}: the first command that needs it makes it"
+                )
+                return
         with engine.opened(settings) as database:
             storage = storage_identity.opened(database, settings)
             readiness = Readiness(Installation(database, storage, settings))

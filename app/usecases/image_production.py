@@ -149,7 +149,7 @@ def run_image_production(
 
 
 def _with_what_was_assumed(production: Production, scenes: Sequence[Scene]) -> Production:
-    """The frame of the points says so where it follows from an accuracy that nobody stated."""
+    """The production, whose frame names the accuracy that was assumed for images that state none."""
     unstated = sum(
         statement.subject is Subject.ACCURACY and statement.use is Use.ASSUMED
         for scene in scenes

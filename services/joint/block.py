@@ -331,7 +331,9 @@ def _frames(scenes: Sequence[MeasuredScene], block: IntArray) -> tuple[Frame, ..
         elif why_unknown(frame) or why_unknown(datum):
             frames.append(unstated)
         else:
-            frames.append(Frame(frame.covariance_m2 + datum.covariance_m2, assumed=frame.assumed))
+            frames.append(
+                Frame(frame.covariance_m2 + datum.covariance_m2, assumed=frame.assumed or datum.assumed)
+            )
     return tuple(frames)
 
 

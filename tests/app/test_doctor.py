@@ -43,6 +43,15 @@ def test_a_database_that_does_not_answer_ends_with_a_refusal_and_the_rest_is_tol
     assert "storage" not in parts
 
 
+def test_nothing_is_made_where_there_is_no_installation_yet(tmp_path: Path) -> None:
+    environment = {**os.environ, "AMERS_DATA_FOLDER": str(tmp_path / "data")}
+    environment.pop("AMERS_DATABASE_URL", None)
+    done = amers_here(("doctor",), environment)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "the first command that needs it makes it" in done.stdout
+    assert not (tmp_path / "data").exists()
+
+
 def test_a_working_installation_ends_well(settings: Settings) -> None:
     done = amers_here(("doctor",), environment_of(settings))
     assert done.returncode == 0, done.stdout + done.stderr
