@@ -8,7 +8,6 @@ from amers.services.production.block_plan import PlannedImage
 from amers.services.production.image_pairs import PARTNERS
 from amers.services.production.tie_patches import searched_pixels
 
-_DEFAULT = FeatureOptions()
 _FEATURE_S = 0.65
 """Of a million pixels in which features are found."""
 _PAIR_S = 0.17
@@ -65,7 +64,7 @@ def production_cost(
     spacing_m: float,
     *,
     surface_pairs: int = 10,
-    features: FeatureOptions = _DEFAULT,
+    fine_gsd_m: float = 2.0,
 ) -> ProductionCost:
     """The cost of a block of points.
 
@@ -74,13 +73,14 @@ def production_cost(
         area_km2: ground that two of them show.
         spacing_m: of the points.
         surface_pairs: pairs of images that give the surface at a point, at most.
-        features: of tie points.
+        fine_gsd_m: ground sampling of the fine chips.
     """
     count, shown_km2 = len(images), sum(one.size_m[0] * one.size_m[1] for one in images) / 1e6
     points = area_km2 * 1e6 / spacing_m**2
     views = shown_km2 / area_km2
     pairs_of_point = min(surface_pairs, views * (views - 1.0) / 2.0)
     pixels = [one.size_m[0] * one.size_m[1] / one.gsd_m**2 for one in images]
+    features = FeatureOptions().for_chips(max(one.gsd_m for one in images), fine_gsd_m)
     searched = [searched_pixels(one, min(pixels), points * views / count, features) for one in pixels]
     partners = min(PARTNERS, count - 1)
     found_mpx = sum(found for found, _ in searched) / 1e6

@@ -29,7 +29,7 @@ from amers.services.production.image_passes import dates_of_points, image_passes
 from amers.services.production.point_squares import point_squares, ties_in_squares
 from amers.services.production.point_surfaces import surfaces_at
 from amers.services.production.point_views import check_image_names, shows_chip
-from amers.services.production.tie_points import features_for_chips, find_tie_points, joined_ties
+from amers.services.production.tie_points import find_tie_points, joined_ties
 from amers.services.quality.density import GroundMask
 from amers.services.statements import Statements
 from amers.services.tasks import Effort, Work
@@ -282,7 +282,7 @@ def _tied(
         return flat, images.adjusted(ties, flat)
 
     options, passes = images.options, images.of_passes
-    features = features_for_chips(images.scenes, options.features, options.fine_gsd_m)
+    features = options.features.for_chips(max(map(scene_gsd_m, images.scenes)), options.fine_gsd_m)
     ties = find_tie_points(images.scenes, passes, features, work, part_of(progress, 0.0, 0.5))
     if len(ties) == 0:
         why = "tie points: the images have nothing in common"

@@ -1,7 +1,7 @@
 """Tie points over any number of images: features of each, matches of chosen pairs, tracks."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -105,24 +105,6 @@ def feature_reduction(scenes: Sequence[Scene], options: FeatureOptions) -> float
     """How many times coarser than the coarsest image features are looked for at first."""
     smallest = min(scene.image.shape[0] * scene.image.shape[1] for scene in scenes)
     return reduction_of(smallest, options)
-
-
-def features_for_chips(
-    scenes: Sequence[Scene], options: FeatureOptions, fine_gsd_m: float
-) -> FeatureOptions:
-    """Options by which features are no coarser than the fine chips of the points that come of them.
-
-    Details of 1.4 times the sampling of the chips have heights that err by 0.8 to 0.9 m, those of their
-    own sampling by 0.5 to 0.6 m, where 0.6 to 0.7 m is stated (`test_new_points.py`, three draws).
-
-    Args:
-        scenes: images of the block.
-        options: of the features.
-        fine_gsd_m: ground sampling of the fine chips.
-    """
-    coarsest_m = max(scene_gsd_m(scene) for scene in scenes)
-    most = min(options.most_reduced, max(1.0, fine_gsd_m / coarsest_m))
-    return replace(options, most_reduced=most)
 
 
 def no_ties() -> Observations:
