@@ -34,8 +34,8 @@ def produce(images: Sequence[Path], control: Sequence[object], output: Path) -> 
 def judged_block(folder: Path, products: Mapping[str, Rendered]) -> PointVerdict:
     """The true errors of the points of a block against what it declares.
 
-    A point is what its chips show in their middles: each is found in the image that it was cut from,
-    whose true line of sight meets those of the others in the true point.
+    The middle of a chip shows the point. It is found again in the image of the chip, and the true lines
+    of sight of all these positions intersect at the true point.
 
     Args:
         folder: of the block.

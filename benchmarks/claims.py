@@ -1,10 +1,10 @@
 """A day of a constellation through the queue: 64 workers, 4,000 scenes, simulated work.
 
 Queue, database and files are real: each worker takes a ticket of procrastinate, claims a job, reads the
-file of its scene, reports progress, waits as long as a registration may take, stores the files of a
-result with their checksums, and ends the job and its ticket, by the functions that workers use. Workers
-are threads of one process. Times are those that a worker sees: of a claim, its transaction and its wait
-for other claims included; and between the end of a job and the claim of the next.
+file of its scene, reports progress, waits for the time of a registration, stores the files of a result
+with their checksums, and ends the job and its ticket. The functions are those of workers, which are
+threads of one process here. Two times are measured: that of a claim, with its transaction and its wait
+for other claims, and that between the end of a job and the next claim.
 Run: python -m benchmarks.claims [--workers 64] [--scenes 4000] [--work-s 3]
 """
 
