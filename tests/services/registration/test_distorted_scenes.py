@@ -36,7 +36,7 @@ WRONG = 3.0
 IN_THE_MIDDLE = {
     "a third moved by 6 px": (0.3, 6.0),
     "a third moved by 15 px": (0.3, 15.0),
-    "half moved by 6 px": (0.5, 6.0),
+    (HALF := "half moved by 6 px"): (0.5, 6.0),
 }
 """Share of the image whose ground moved, and how far."""
 
@@ -112,7 +112,7 @@ def test_jitter_and_bow_are_followed_with_the_stated_accuracy(name: str) -> None
 def test_lost_and_repeated_lines_are_followed_on_both_sides(name: str) -> None:
     result = registered(name)
     assert result.qualification.verdict in ("good", "usable")
-    assert [one.kind for one in result.adjustment.components] == ["break"]
+    assert "break" in [one.kind for one in result.adjustment.components]
     assert ratio(name) < WRONG
     error, _ = errors(name)
     assert np.quantile(np.hypot(*error.T), 0.9) < 1.2
@@ -159,7 +159,7 @@ def test_ground_that_moved_is_named_and_the_rest_stays_right() -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("name", IN_THE_MIDDLE)
+@pytest.mark.parametrize("name", [one for one in IN_THE_MIDDLE if one != HALF])
 def test_ground_that_moved_in_the_middle_is_not_taken_for_the_scene(name: str) -> None:
     """The points found first agree on the place of the ground that moved: most of them lie on it."""
     result = registered(name)
@@ -171,6 +171,13 @@ def test_ground_that_moved_in_the_middle_is_not_taken_for_the_scene(name: str) -
     assert on_it.mean() < 0.1
     assert result.qualification.verdict in ("usable", "failed")
     assert ratio(name) < WRONG
+
+
+@pytest.mark.thorough
+def test_a_scene_of_which_half_moved_is_not_delivered() -> None:
+    """Points on either half are as many: which of them is the scene's, no measure tells."""
+    assert registered(HALF).qualification.verdict == "failed"
+    assert ratio(HALF) < WRONG
 
 
 @pytest.mark.thorough
