@@ -1,6 +1,6 @@
 """The process that puts a registered scene on the map, before and after, and its tiles."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -35,12 +35,13 @@ from amers.services.formats.images.map_tiles import read_map_tile, write_map_til
 from amers.services.formats.images.raster import RasterImage
 from amers.services.formats.images.tiles import grey_range
 from amers.services.formats.text_files import read_text
-from amers.services.imagery.scene import Scene, scene_footprint
+from amers.services.imagery.scene import Scene, common_footprint, scene_footprint
+from amers.services.orthorectification.outline import image_outline
 from amers.services.orthorectification.point_terrain import terrain_of_points
 from amers.services.orthorectification.rectify import OrthoOptions, orthorectify
 from amers.services.orthorectification.tile_limits import TILE_PX, TileLimits, TilePlace, choose_tiles
 from amers.services.terrain import Terrain
-from amers.services.types import Progress, no_progress
+from amers.services.types import Array, Progress, no_progress
 
 Layer = Literal["raw", "registered"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
@@ -78,11 +79,13 @@ class MappedScene:
         limits: of its tiles, from the finest zoom to the coarsest.
         heights: where the heights of the ground come from.
         bounds: west, south, east and north of the scene, degrees; the east may exceed 180.
+        outlines: (m, 2) lon, lat of the edge of the pixels through each model, degrees, not closed.
     """
 
     limits: list[TileLimits]
     heights: str
     bounds: tuple[float, float, float, float]
+    outlines: dict[Layer, Array]
 
 
 def map_scene(
@@ -106,7 +109,7 @@ def map_scene(
     raw, _ = read_registered_scene(SceneModel(files.image, files.model))
     registered, _ = read_registered_scene(files)
     scenes: dict[Layer, Scene] = {"raw": raw, "registered": registered}
-    ground = _ground(files.registration, terrain, raw)
+    ground = _ground(files.registration, terrain, [raw, registered])
     limits = choose_tiles([raw, registered], ground.range_m())
     greys = grey_range(raw.image)
     options = OrthoOptions(window_px=TILE_PX)
@@ -119,25 +122,24 @@ def map_scene(
             [scene.image], scene.model, ground, limits[0].grid(), options, progress=report
         )
         write_map_tiles(outputs[layer], limits, windows, greys)
+    outlines = {layer: image_outline(scene, ground) for layer, scene in scenes.items()}
     for scene in scenes.values():
         assert isinstance(scene.image, RasterImage)
         scene.image.close()
     footprint = scene_footprint(registered, ground.range_m())
     bounds = (*footprint.min(axis=0).tolist(), *footprint.max(axis=0).tolist())
-    return MappedScene(limits, ground.vertical, bounds)
+    return MappedScene(limits, ground.vertical, bounds, outlines)
 
 
-def _ground(registration: Path, terrain: TerrainFile | None, scene: Scene) -> Terrain:
-    """The terrain in a file, or between the control points of a registration."""
+def _ground(registration: Path, terrain: TerrainFile | None, scenes: Sequence[Scene]) -> Terrain:
+    """The terrain in a file, or between the control points of a registration, below all the scenes."""
     if terrain is not None:
-        ground = read_terrain(terrain)
-        return ground.around(scene_footprint(scene))
+        return read_terrain(terrain).around(common_footprint(scenes))
     path = registration / POINTS_NAME
     points = parse_geojson_points(read_text(path), POINTS_NAME)
     heights = points.lon_lat_h[:, 2]
-    return terrain_of_points(
-        points.lon_lat_h, scene_footprint(scene, (float(heights.min()), float(heights.max())))
-    )
+    range_m = float(heights.min()), float(heights.max())
+    return terrain_of_points(points.lon_lat_h, common_footprint(scenes, range_m))
 
 
 def scene_tile(storage: Storage, job: Job, layer: Layer, place: TilePlace) -> bytes:
@@ -226,6 +228,7 @@ def _run(work: Work) -> Commit:
             _LIMITS: [asdict(limits) for limits in mapped.limits],
             "bounds": list(mapped.bounds),
             "heights": mapped.heights,
+            "outlines": {layer: ring.tolist() for layer, ring in mapped.outlines.items()},
             "files": stored,
         }
 
@@ -257,5 +260,9 @@ MAP_SCENE = Process(
             "title": "West, south, east and north of the scene, degrees",
         },
         "heights": {"type": "string", "title": "Origin of the heights of the ground"},
+        "outlines": {
+            "type": "object",
+            "title": "Edge of the pixels on the ground, raw and registered: longitudes and latitudes",
+        },
     },
 )

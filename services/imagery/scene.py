@@ -1,11 +1,12 @@
 """A scene: an image, its model and its acquisition, the input of registration and production."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from amers.services.geodesy import ecef_from_east_north_up
+from amers.services.geodesy import continuous, ecef_from_east_north_up
 from amers.services.imagery.pixel_checks import PixelFinding, pixel_findings
 from amers.services.imagery.source import ImageSource, image_gsd_m
 from amers.services.sensors.base import SensorModel
@@ -61,6 +62,23 @@ def scene_gsd_m(scene: Scene) -> float:
     return image_gsd_m(scene.model, scene_centre(scene))
 
 
+def image_border(shape: tuple[int, int]) -> Array:
+    """Positions (m, 2) along the outer edge of an image of (lines, samples), pixels; not closed."""
+    lines, samples = shape
+    t = np.linspace(0.0, 1.0, FOOTPRINT_PER_SIDE, endpoint=False)
+    corners = np.array(
+        [
+            [-0.5, -0.5],
+            [-0.5, samples - 0.5],
+            [lines - 0.5, samples - 0.5],
+            [lines - 0.5, -0.5],
+        ]
+    )
+    return np.concatenate(
+        [a + t[:, None] * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)]
+    )
+
+
 def scene_footprint(scene: Scene, heights_m: tuple[float, float] | None = None) -> Array:
     """Outline of the ground that the image can show between two heights.
 
@@ -73,19 +91,7 @@ def scene_footprint(scene: Scene, heights_m: tuple[float, float] | None = None) 
         counter-clockwise, not closed. Longitudes are continuous: they exceed 180 degrees where the
         outline crosses the antimeridian.
     """
-    lines, samples = scene.image.shape
-    t = np.linspace(0.0, 1.0, FOOTPRINT_PER_SIDE, endpoint=False)
-    corners = np.array(
-        [
-            [-0.5, -0.5],
-            [-0.5, samples - 0.5],
-            [lines - 0.5, samples - 0.5],
-            [lines - 0.5, -0.5],
-        ]
-    )
-    border = np.concatenate(
-        [a + t[:, None] * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)]
-    )
+    border = image_border(scene.image.shape)
     rings = [
         scene.model.locate(border, np.full(len(border), height_m))[:, :2]
         for height_m in heights_m or scene.model.height_range_m
@@ -94,6 +100,19 @@ def scene_footprint(scene: Scene, heights_m: tuple[float, float] | None = None) 
     outline = outline[np.isfinite(outline).all(axis=1)]
     outline[:, 0] = outline[0, 0] + (outline[:, 0] - outline[0, 0] + 180.0) % 360.0 - 180.0
     return np.asarray(outline[ConvexHull(outline).vertices])
+
+
+def common_footprint(scenes: Sequence[Scene], heights_m: tuple[float, float] | None = None) -> Array:
+    """The outlines of scenes of the same ground, one after the other.
+
+    Args:
+        scenes: the images.
+        heights_m: lowest and highest ground; None for those of each model.
+
+    Returns:
+        (m, 2) lon, lat as of `scene_footprint`, in longitudes that are continuous over all scenes.
+    """
+    return continuous(np.concatenate([scene_footprint(scene, heights_m) for scene in scenes]))
 
 
 def view_direction(model: SensorModel, line_sample: Array, lon_lat_h: Array) -> tuple[Array, Array]:

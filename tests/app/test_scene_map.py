@@ -181,6 +181,22 @@ def test_coarser_tiles_show_the_same_and_nothing_outside_of_the_scene(on_map: Sc
     assert covered_m2 == pytest.approx([scene_m2] * len(covered_m2), rel=0.02)
 
 
+def test_the_outlines_run_along_the_pixels_of_their_own_model(on_map: SceneOnMap) -> None:
+    """Not around both: the registration moved the scene by many pixels of the tiles."""
+    finest = on_map.levels[0]
+    for layer in LAYERS:
+        lon, lat = np.transpose(on_map.results["outlines"][layer])
+        x = (lon + 180.0) / 360.0
+        y = 0.5 - np.arctanh(np.sin(np.radians(lat))) / (2.0 * np.pi)
+        first = np.array([finest.first_column, finest.first_row])
+        corners = (np.column_stack([x, y]) * 2**finest.zoom - first) * TILE_PX - 0.5
+        valid = on_map.mosaic(layer, finest)[:, :, 1].astype(np.uint8)
+        inside = np.zeros_like(valid)
+        cv2.fillPoly(inside, [np.round(corners).astype(np.int32)], 1)
+        edge_px = cv2.arcLength(corners.astype(np.float32)[:, None], True)
+        assert (inside != valid).sum() < 1.5 * edge_px, layer
+
+
 def test_tiles_are_only_for_the_owner_and_with_the_scope_to_read(
     on_map: SceneOnMap, bearer: Bearer
 ) -> None:
