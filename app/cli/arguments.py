@@ -5,10 +5,11 @@ from collections.abc import Iterator
 from typing import Any
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperOption
 
 from amers.app.cli.examples import epilogue
 from amers.app.cli.exit_status import is_refusal
+from amers.app.cli.option_groups import groups
 
 INPUT = re.compile(r"^[a-z_]+(?=: )|(?<=`)[a-z_]+(?=`)")
 """The name of an input in an error of the science or of a use case, which know no options."""
@@ -50,9 +51,13 @@ class CheckedCommand(TyperCommand):
         return defaults
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write the help, which ends with examples."""
+        """Write the help: options in groups where there are many; it ends with examples."""
         _, _, command = ctx.command_path.partition(" ")
         self.epilog = epilogue(command)
+        options: list[Any] = [one for one in self.params if isinstance(one, TyperOption)]
+        of_names = groups(command, [str(one.name) for one in options])
+        for option in options:
+            option.rich_help_panel = of_names.get(str(option.name))
         super().format_help(ctx, formatter)
 
     def invoke(self, ctx: Any) -> Any:

@@ -56,7 +56,7 @@ def amers(
         typer.Option(
             metavar="FILE.toml",
             envvar="AMERS_OPTIONS",
-            help="File with options of commands, such as dem under [scene.register].",
+            help="File with options of commands, such as dem under \\[scene.register].",
         ),
     ] = None,
 ) -> None:

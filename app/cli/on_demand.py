@@ -79,7 +79,9 @@ class GroupOnDemand(TyperGroup):
         """The command to run, and the rest of the arguments."""
         name, _, rest = super().resolve_command(ctx, args)
         entry = self._tree[str(name)]
-        if isinstance(entry, Command) and "--help" in rest and (shown := recorded(entry.function)):
+        # A shell that completes a word needs the names of options, as the help does.
+        is_shown = "--help" in rest or ctx.resilient_parsing
+        if isinstance(entry, Command) and is_shown and (shown := recorded(entry.function)):
             return name, _as_command(str(name), shown), rest
         return name, self.commands[str(name)], rest
 

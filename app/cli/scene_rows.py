@@ -30,6 +30,19 @@ _TABLE = (
     "seconds",
 )
 """Figures of a scene in the table of many scenes."""
+_LABELS = {
+    "visible": "points visible",
+    "matched": "points matched",
+    "active": "points active",
+    "held_percent": "image held by points (%)",
+    "shift_px": "shift in line, sample (px)",
+    "shift_m": "shift on the ground (m)",
+    "residual_rms_px": "residual in the image, rms (px)",
+    "refined_model_error_px": "error of the refined model, largest (px)",
+    "check_ce90_m": "CE90 of the check points (m)",
+    "seconds": "time (s)",
+}
+"""Figures of one scene for people, with their axes and units."""
 _STATED = ("relative_to_control_points", "on_the_earth")
 """The two accuracies of an outcome."""
 
@@ -63,7 +76,9 @@ def show_outcome(outcome: Outcome, *, as_json: bool) -> None:
     else:
         show_statements(outcome.get("statements", []))
         _show_findings([outcome])
-        show_one(_verdict_rows(outcome) | _other_rows(outcome, tuple(outcome)), as_json=False)
+        others = _other_rows(outcome, tuple(outcome))
+        labelled = {_LABELS.get(name, name.replace("_", " ")): value for name, value in others.items()}
+        show_one(_verdict_rows(outcome) | labelled, as_json=False)
         if "marks" in outcome:
             typer.echo()
             show([_mark_row(mark) for mark in outcome["marks"]["marks"]], as_json=False)
@@ -137,6 +152,7 @@ def _other_rows(outcome: Outcome, names: tuple[str, ...]) -> dict[str, Any]:
         "pixel_findings",
         "findings",
         "marks",
+        "exit_status",
         *_STATED,
     }
     return {name: _rounded(outcome.get(name)) for name in names if name not in shown}
