@@ -1,66 +1,38 @@
 """Functions replaced by recorders: where the values that an interface is given go."""
 
+import contextlib
 import dataclasses
 import inspect
-import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from datetime import datetime
 from enum import Enum
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar
-from unittest.mock import MagicMock
+from typing import Any
 from uuid import UUID
 
 import numpy as np
 import pytest
+from pydantic import BaseModel
+from starlette.responses import Response
+
+from tests.app.stand_ins import PLACE, Anything, result_of
 
 RECORDED = ("amers.app.", "amers.services.")
 CALLED = ("amers.app.config", "amers.services.docstrings")
 """Modules that are called as they are."""
-OUTPUT = "amers.app.cli.output"
-SHOWING = ("show", "show_one", "print_json")
-"""Functions of the command line by which results are shown."""
 LEFT_OUT = ("seconds", "_mock", "_spec")
 """How keys begin whose values are of this run alone, or of the stand-ins."""
-OF_ONE = ("stored_scenes",)
-"""Functions whose result stands for one thing, in a list."""
+OF_THIS_RUN = ("date", "content-length", "etag", "last-modified", "set-cookie")
+"""Headers that are left out."""
+MADE: Mapping[str, Callable[..., Any]] = {
+    "stored_scenes": lambda both: both[:1],
+    "replacing": lambda _folder: contextlib.nullcontext(Path()),
+}
+"""Functions with a result of their own: one scene of two, an empty folder in place of one to write."""
 _CONVERTED = ("parse_", "printable", "by_", "checked_", "named_", "box_of", "stated_", "file_place")
 """How functions begin that only convert what is given: these are called."""
-
-_TWO = ("first", "second")
-"""What any result consists of; these consist of nothing."""
-
-
-class Anything(MagicMock):
-    """A result that is printed, compared and passed on like any.
-
-    Attributes:
-        notes: of the recorders at work.
-    """
-
-    notes: ClassVar[list[tuple[str, str]]] = []
-
-    def __init__(self, *arguments: Any, **named: Any) -> None:
-        """Replace what every instance of a mock has of its own."""
-        super().__init__(*arguments, **named)
-        for name in ("__lt__", "__gt__", "__le__", "__ge__"):
-            setattr(self, name, lambda _self, _other: False)
-        if self._extract_mock_name() not in _TWO:
-            self.__iter__ = lambda _self: iter([Anything(name=name) for name in _TWO])
-
-    def __format__(self, _spec: str) -> str:
-        """Some text."""
-        return "anything"
-
-    def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """Note what a method of a result is called with."""
-        name = re.sub(r"\(\)(?=\.|$)", "", self._extract_mock_name())
-        for place, value in [*enumerate(arguments), *named.items()]:
-            if "__" not in name:
-                Anything.notes.extend(leaves(f"{name}({place})", value))
-        return super().__call__(*arguments, **named)
 
 
 class Recorders:
@@ -74,7 +46,7 @@ class Recorders:
         """Replace the functions of other packages in the modules of a package, but some, or in one."""
         self.notes: list[tuple[str, str]] = []
         self._package = package
-        Anything.notes = self.notes
+        Anything.called = self._called
         for name, module in list(sys.modules.items()):
             if name.startswith(package) and name not in but:
                 for own, value in list(vars(module).items()):
@@ -87,8 +59,6 @@ class Recorders:
         if isinstance(value, ModuleType):
             return _RecordedModule(self, value) if self._is_recorded(value.__name__) else None
         of = getattr(value, "__module__", "") or ""
-        if inspect.isfunction(value) and of == OUTPUT and value.__name__ in SHOWING:
-            return self.of(value)
         if inspect.isfunction(inspect.unwrap(value)) and self._is_recorded(of):  # type: ignore[arg-type]
             return None if value.__name__.startswith(_CONVERTED) else self.of(value)
         return None
@@ -98,12 +68,14 @@ class Recorders:
         name = function.__qualname__
 
         def recorder(*arguments: Any, **named: Any) -> Any:
-            for place, value in [*enumerate(arguments), *named.items()]:
-                self.notes.extend(leaves(f"{name}({place})", value))
-            result = Anything(name=f"{name}()")
-            return [result] if name in OF_ONE else result
+            self._called(name, {**dict(enumerate(arguments)), **named})
+            return MADE.get(name, lambda result: result)(result_of(function))
 
         return recorder
+
+    def _called(self, name: str, arguments: Mapping[int | str, Any]) -> None:
+        for place, value in arguments.items():
+            self.notes.extend(leaves(f"{name}({place})", value))
 
     def _is_recorded(self, module: str) -> bool:
         return module.startswith(RECORDED) and not module.startswith((self._package, *CALLED))
@@ -124,7 +96,9 @@ class _RecordedModule:
 def leaves(path: str, value: Any, depth: int = 0) -> Iterator[tuple[str, str]]:
     """The values in a value, each with the path that leads to it."""
     parts = _parts(value) if depth < 6 else None
-    if parts is not None:
+    if hasattr(value, PLACE):
+        yield path, getattr(value, PLACE)
+    elif parts is not None:
         for name, part in parts.items():
             yield from leaves(f"{path}{name}", part, depth + 1)
     elif isinstance(value, Anything):
@@ -139,6 +113,12 @@ def _parts(value: Any) -> dict[str, Any] | None:
     """What a value consists of, by its place; None for a single value."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f".{one.name}": getattr(value, one.name, None) for one in dataclasses.fields(value)}
+    if isinstance(value, BaseModel):
+        return {f".{name}": one for name, one in vars(value).items()}
+    if isinstance(value, Response):
+        body = bytes(getattr(value, "body", b"")).decode(errors="replace")
+        headers = {name: text for name, text in value.headers.items() if name not in OF_THIS_RUN}
+        return {".status": value.status_code, ".body": body, ".headers": headers}
     if isinstance(value, dict):
         return {f"[{key}]": one for key, one in value.items() if not str(key).startswith(LEFT_OUT)}
     if isinstance(value, list | tuple):

@@ -23,7 +23,8 @@ from typer.testing import CliRunner
 from amers.app.cli.commands import COMMANDS
 from amers.app.cli.main import app
 from amers.app.cli.on_demand import Group, Tree, _load
-from tests.app.recorders import SHOWING, Recorders
+from amers.app.request_context import Origin
+from tests.app.recorders import Recorders
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "wiring.json"
 PACKAGE = "amers.app.cli."
@@ -56,12 +57,14 @@ TEXTS: Mapping[str, str] = {
     "--cloud-limits": "17,19",
     "--control-points": "17,19",
     "--pixels": "corner",
+    "batch": "batches()[0]",
 }
 """Values of options whose text has a form."""
 BESIDE: Mapping[str, tuple[str, ...]] = {
     "scene ortho": ("--vertical", "ellipsoid"),
     "vectors correct": ("--vertical", "ellipsoid"),
     "vectors project": ("--vertical", "ellipsoid"),
+    "block renew": ("--image", "image"),
     "block frame": ("--control", "FILE", "--images", "FILE"),
     "production run": ("--images", "FILE"),
     "base make": ("--bbox", "1.0", "2.0", "1.1", "2.1"),
@@ -82,7 +85,14 @@ COMPANIONS: tuple[tuple[str, tuple[str, ...]], ...] = (
 """What an option needs beside it, by how its name begins; the first that fits."""
 _FILES = ("dem", "control_dem", "model")
 """Options whose files the command itself looks for."""
-_OBJECT = re.compile(r" at 0x[0-9a-f]+| id='\d+'|/\d{12,}|" + re.escape(gettempdir()) + r"/[\w.-]+")
+_USER = Origin().actor_name
+"""As the audit names who calls commands."""
+_OF_THIS_RUN = re.compile(
+    r" at 0x[0-9a-f]+| id='\d+'|/\d{12,}|[\d-]+ [\d:]+\.\d{6}\+00:00|(?<=seconds)\W+[\d.]+,?|"
+    + re.escape(gettempdir())
+    + r"/[\w.-]+"
+)
+"""Addresses of objects, times of now, durations, and temporary folders."""
 
 
 def commands(tree: Tree = COMMANDS, words: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
@@ -171,12 +181,15 @@ def run(words: list[str], folder: Path) -> list[tuple[str, str]]:
     """What a command hands on, without the names of temporary folders."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setenv("AMERS_DATA_FOLDER", str(folder / "data"))
+        monkeypatch.chdir(folder / "empty")
         recorders = Recorders(monkeypatch, PACKAGE)
         with contextlib.suppress(Exception):
             result = CliRunner().invoke(app, words)
+            recorders.notes += [(SHOWN, line.rstrip()) for line in result.output.splitlines()]
             recorders.notes.append(("exit status", str(result.exit_code)))
     plain = [
-        (path, _OBJECT.sub("", text.replace(str(folder), "FOLDER"))) for path, text in recorders.notes
+        (path, _OF_THIS_RUN.sub("", text.replace(str(folder), "FOLDER").replace(_USER, "USER")))
+        for path, text in recorders.notes
     ]
     return plain
 
@@ -185,11 +198,12 @@ def wiring(words: tuple[str, ...], folder: Path) -> dict[str, list[str]]:
     """Where each option of a command goes, and as what."""
     own = parameters(words)
     (folder / "beside").write_text("")
+    (folder / "empty").mkdir()
     beside = [str(folder / "beside") if w == "FILE" else w for w in BESIDE.get(" ".join(words), ())]
     required = [word for one in own if one.required for word in value_of(one, folder)] + beside
     found: dict[str, list[str]] = {}
     base = run([*words, *required], folder)
-    found[SHOWN] = sorted({f"{path} = {text}" for path, text in base if path.startswith(SHOWING)})
+    found[SHOWN] = [text for path, text in base if path == SHOWN]
     bases: dict[tuple[str, ...], list[tuple[str, str]]] = {(): base}
     names = {name for one in own for name in one.opts}
     for one in own:
@@ -202,7 +216,10 @@ def wiring(words: tuple[str, ...], folder: Path) -> dict[str, list[str]]:
         if with_it not in bases:
             bases[with_it] = run([*words, *required, *with_it], folder)
         notes = run([*words, *required, *with_it, *value_of(one, folder)], folder)
-        moved = set(notes) - set(bases[with_it])
+        if one.opts[0] == "--json":
+            found[one.opts[0]] = [text for path, text in notes if path == SHOWN]
+            continue
+        moved = {(path, text) for path, text in notes if path != SHOWN} - set(bases[with_it])
         found[one.opts[0]] = sorted({f"{path} = {text}" for path, text in moved})
     return found
 

@@ -15,6 +15,7 @@ import typing
 from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, date, datetime
 from enum import Enum
+from itertools import chain
 from pathlib import Path
 from tempfile import gettempdir
 from typing import Any
@@ -29,12 +30,19 @@ from pydantic import BaseModel
 from amers.app.main import ROUTERS
 from amers.app.usecases.jobs import PROCESSES
 from amers.app.usecases.processes import Process, Work
-from tests.app.recorders import Anything, Recorders
+from tests.app.recorders import Recorders, leaves
+from tests.app.stand_ins import Anything
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "wiring_of_jobs.json"
 Found = dict[str, list[str]]
 Notes = list[tuple[str, str]]
 _CHANGING = re.compile(r" at 0x[0-9a-f]+| id='\d+'|/\d{12,}|" + re.escape(gettempdir()) + r"/[\w./-]+")
+GIVES = "gives "
+"""How notes of a result begin."""
+_MOST = 100
+"""Values of a result that are compared: larger ones are documents, which have tests of their own."""
+RESULT = "what it gives"
+"""Beside the inputs: the result with the least inputs, and with all."""
 _WHOLE = re.compile(r"\.inputs\.|^check_file_names\(0\)\.")
 """Notes of all inputs together, which do not tell where one of them goes."""
 
@@ -126,23 +134,26 @@ def of_endpoint(route: APIRoute) -> Found:
     return _found(call, own, least, APART.get(name_of(route), ()))
 
 
-def _answer(function: Callable[..., Any], given: dict[str, Any]) -> None:
-    """Call an endpoint, to its first pause if it is asynchronous."""
+def _answer(function: Callable[..., Any], given: dict[str, Any]) -> Any:
+    """What an endpoint gives, called to its first pause if it is asynchronous."""
     result = function(**given)
-    if inspect.iscoroutine(result):
-        try:
-            result.send(None)
-        finally:
-            result.close()
+    if not inspect.iscoroutine(result):
+        return result
+    try:
+        return result.send(None)
+    except StopIteration as end:
+        return end.value
+    finally:
+        result.close()
 
 
 class _Attempts(Recorders):
     """Recorders that also note why a call ended."""
 
     def attempt(self, call: Callable[[], Any]) -> None:
-        """Make a call, and note the exception that ends it."""
+        """Make a call, and note what it gives, or the exception that ends it."""
         try:
-            call()
+            self.notes.extend((GIVES + path, text) for path, text in leaves("", call()))
         except Exception as error:
             self.notes.append((f"ends with {type(error).__name__}", str(error).split("\n")[0][:120]))
 
@@ -166,12 +177,13 @@ def _found(
     others = {
         name: _named_value(name, kind, number, 1) for number, (name, kind) in enumerate(own.items())
     }
-    found = {}
     beside = (
         {name: values[name] for name in values if name in least},
         {name: values[name] for name in values if name not in apart},
     )
     before = [set(call(inputs)) for inputs in beside]
+    given = sorted({f"{path} = {text}" for path, text in chain(*before) if path.startswith(GIVES)})
+    found = {RESULT: given if len(given) <= _MOST else [f"{len(given)} values"]}
     for name, other in others.items():
         moved: set[str] = set()
         for inputs, notes in zip(beside, before, strict=True):
