@@ -1,5 +1,6 @@
 """What a worker makes of the end of an attempt's process, whatever the process has written."""
 
+import errno
 import signal
 import time
 from collections.abc import Mapping, Sequence
@@ -112,8 +113,7 @@ def test_a_job_that_may_not_have_more_says_how_much_and_by_which_setting(
     error = worker.attempt_ends(code).error
     assert error is not None
     assert {"type", "title", "detail"} <= error.keys()
-    assert variable in error["detail"]
-    assert f" {named}," in error["detail"]
+    assert f" {named}, the limit of this service ({variable})" in error["detail"]
 
 
 @pytest.mark.parametrize(
@@ -127,6 +127,37 @@ def test_a_job_whose_process_broke_off_is_tried_three_times(worker: Worker, code
     job = worker.attempt_ends(code)
     assert job.error is not None
     assert (job.state, job.error["title"]) == ("failed", title)
+
+
+@pytest.mark.parametrize(
+    ("error", "failures"),
+    [
+        (OSError(errno.ENOSPC, "full"), [1, 2, None]),
+        (OSError(errno.EDQUOT, "quota"), [1, 2, None]),
+        (OSError(errno.EIO, "broken"), [0, 0, 0]),
+        (OSError(errno.EROFS, "read-only"), [0, 0, 0]),
+    ],
+)
+def test_a_disk_that_is_full_ends_a_job_at_last_and_a_disk_that_is_away_does_not(
+    worker: Worker, error: OSError, failures: list[int | None]
+):
+    """The files of a job that fills a disk may be the reason; a disk that is away is never its fault."""
+
+    class Failing(Processes):
+        def start(self, *_arguments: object) -> "Processes":
+            self.closed = True
+            raise error
+
+    for expected in failures:
+        with worker.database.transaction() as connection:
+            run_sql(connection, "update job set not_before = null")
+        job = worker.attempt_of(Failing(None, worker.storage))
+        if expected is None:
+            assert job.error is not None
+            assert (job.state, job.error["title"]) == ("failed", "No room")
+            assert job.error["detail"].endswith("was full in 3 attempts")
+        else:
+            assert (job.state, job.failures, job.error) == ("accepted", expected, None)
 
 
 @pytest.mark.parametrize("code", [-signal.SIGKILL, -signal.SIGTERM])

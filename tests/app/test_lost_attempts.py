@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from uuid import UUID
+from uuid import UUID, uuid4
 
 import psycopg
 import pytest
@@ -272,6 +272,37 @@ def test_room_that_an_attempt_has_while_it_runs_or_for_its_results_is_not_lost(d
         attempts.reserve_results(connection, job.id, 2, 1000)
         attempts.succeed(connection, job.id, 2, {"files": {}})
     assert lost() == {}
+
+
+@pytest.mark.parametrize(
+    ("state", "results", "removed", "counts"),
+    [
+        ("accepted", "null", "null", False),
+        ("running", "null", "null", True),
+        ("running", "null", "now()", False),
+        ("successful", "null", "null", True),
+        ("successful", "'{}'", "null", True),
+        ("successful", "'{}'", "now()", False),
+        ("failed", "null", "null", False),
+        ("failed", "'{}'", "null", True),
+        ("failed", "'{}'", "now()", False),
+        ("dismissed", "null", "null", False),
+    ],
+)
+def test_files_of_an_attempt_are_those_of_one_that_runs_or_has_results_that_are_kept(
+    database, state: str, results: str, removed: str, counts: bool
+):
+    other, job, missing = new_job(database), new_job(database), uuid4()
+    with database.transaction() as connection:
+        run_sql(connection, "update job set attempt = 7 where id = %s", [other.id])
+        run_sql(
+            connection,
+            f"update job set attempt = 3, state = '{state}', results = {results}, "
+            f"results_removed_at = {removed} where id = %s",
+            [job.id],
+        )
+        found = attempts.counting_attempts(connection, [job.id, missing])
+    assert found == {job.id: 3 if counts else None}
 
 
 LEASE_S = 0.6
