@@ -35,7 +35,8 @@ class Module:
 
 
 def _of_science(name: str, *more_tests: str) -> Module:
-    return Module(f"services/{name}", (f"services/{name}",), (f"tests/services/{name}", *more_tests))
+    tests = (f"tests/services/{name}", "tests/services/test_all_figures.py", *more_tests)
+    return Module(f"services/{name}", (f"services/{name}",), tests)
 
 
 def _of_service(name: str, sources: str, tests: str) -> Module:
