@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Event, Thread
 
 import numpy as np
 import pytest
@@ -139,9 +140,29 @@ def test_a_cluster_makes_the_same_block_bit_for_bit(images, alone, tmp_path) -> 
         assert make(images, tmp_path / "block", place) == alone
 
 
-def test_a_worker_that_is_killed_in_the_middle_changes_nothing(images, alone, tmp_path) -> None:
+@contextmanager
+def slowed(worker: subprocess.Popen[bytes]) -> Iterator[None]:
+    """A worker that is let work for a fifth of the time."""
+    ended = Event()
+
+    def hold() -> None:
+        while not ended.wait(0.1):
+            worker.send_signal(signal.SIGSTOP)
+            ended.wait(0.4)
+            worker.send_signal(signal.SIGCONT)
+
+    thread = Thread(target=hold)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def test_a_worker_that_is_killed_beside_a_slow_one_changes_nothing(images, alone, tmp_path) -> None:
     work = tmp_path / "work"
-    with dask_cluster(2) as cluster:
+    with dask_cluster(2) as cluster, slowed(cluster.workers[1]):
         killed = []
 
         def kill_one(fraction: float, message: str) -> None:
