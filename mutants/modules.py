@@ -76,12 +76,12 @@ MODULES = (
     _of_service(
         "superseding",
         "db/superseding.py db/density.py",
-        "superseding renewal_density feature_formats reply_models",
+        "superseding renewal_density feature_formats reply_models documents",
     ),
     _of_service(
         "points",
         "db/points.py db/point_detail.py db/history.py usecases/history.py usecases/features/points.py",
-        "unpublished points history chips blocks reply_models",
+        "unpublished points history chips blocks reply_models documents",
     ),
     _of_service("uploads", "usecases/uploads.py db/uploads.py", "uploads upload_faults"),
     _of_service("storage", "storage", "storage storage_identity bucket"),
