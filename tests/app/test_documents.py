@@ -1,7 +1,7 @@
 """What the service says of itself is what it said: collections, their properties, processes, tilings.
 
-A label, a unit, a choice or a limit that changes there is noticed here. After a change that is meant, the
-failing test says where the new documents lie: read what differs, and put them in place of the old ones.
+A label, a unit, a choice or a limit that changes there is noticed here. If it is meant, the test
+says where the new documents lie: read what differs, and put them in place of the old ones.
 """
 
 import json
