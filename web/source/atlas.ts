@@ -12,11 +12,12 @@ import {
 } from "maplibre-gl";
 import { aimWithKeys } from "./aim";
 import { authorization, BASE, get } from "./api";
-import { type Bounds, Comparison, type Pyramid, type Pyramids, TILE_PX } from "./comparison";
+import { type Bounds, Comparison, type Picture, type Pyramid, type Side, TILE_PX } from "./comparison";
 import { h } from "./elements";
 import { goToField, TOWNS } from "./go_to";
 import { degrees, graticule, wrapped } from "./graticule";
-import { type Colouring, landFile, mapStyle, TOWNS_ZOOM } from "./style";
+import { metresPerDegree } from "./ground";
+import { type Colouring, COLOURINGS, landFile, mapStyle, TOWNS_ZOOM } from "./style";
 
 type Outlined = Feature<Geometry | null>;
 type Shape = Geometry | { type: "FeatureCollection"; features: Outlined[] };
@@ -46,6 +47,7 @@ export class Atlas {
   private readonly map: MapLibre | null;
   private readonly ready: Promise<void>;
   private colouring: Colouring = "none";
+  private limits: readonly number[] = [];
   private land = landFile(0);
   private namesTowns = false;
   private blocks: Outlined[] = [];
@@ -89,8 +91,10 @@ export class Atlas {
     container.append(pointer, field);
     map.on("mousemove", ({ lngLat }) => (pointer.textContent = place(wrapped(lngLat.lng), lngLat.lat)));
     map.on("mouseout", () => (pointer.textContent = ""));
-    map.on("mouseenter", "points", () => (map.getCanvas().style.cursor = "pointer"));
-    map.on("mouseleave", "points", () => (map.getCanvas().style.cursor = ""));
+    for (const layer of ["points", "vector-points"]) {
+      map.on("mouseenter", layer, () => (map.getCanvas().style.cursor = "pointer"));
+      map.on("mouseleave", layer, () => (map.getCanvas().style.cursor = ""));
+    }
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", (scheme) => this.repaint(scheme.matches));
   }
 
@@ -109,6 +113,29 @@ export class Atlas {
     signal.addEventListener("abort", () => this.map?.off("moveend", callback));
   }
 
+  /** Leave out the points of the blocks, until the signal aborts: a view draws points of its own. */
+  async hidePoints(signal: AbortSignal): Promise<void> {
+    await this.ready;
+    if (signal.aborted) return;
+    this.map?.setLayoutProperty("points", "visibility", "none");
+    signal.addEventListener("abort", () => this.map?.setLayoutProperty("points", "visibility", "visible"));
+  }
+
+  /** Metres on the ground of a pixel of the screen in the middle of the map. */
+  metresOfPixel(): number {
+    if (!this.map) return 1;
+    const { lng, lat } = this.map.getCenter();
+    const { x, y } = this.map.project([lng, lat]);
+    return (lat - this.map.unproject([x, y + 1]).lat) * metresPerDegree(lat).north;
+  }
+
+  /** Lay an element over the map, until the signal aborts. */
+  overlay(element: HTMLElement, signal: AbortSignal): void {
+    if (!this.map) return;
+    this.map.getContainer().append(element);
+    signal.addEventListener("abort", () => element.remove());
+  }
+
   /** Bring a shape into view, at the zoom `closest` at most. */
   fit(geometry: Shape | null | undefined, closest = 14): void {
     const positions = geometry ? inOnePlace(positionsOf(geometry)) : [];
@@ -123,8 +150,14 @@ export class Atlas {
     return this.colouring;
   }
 
-  set pointColouring(colouring: Colouring) {
+  /** The values at which classes of the points meet. */
+  get pointLimits(): readonly number[] {
+    return this.limits;
+  }
+
+  colourPoints(colouring: Colouring, limits: readonly number[] = COLOURINGS[colouring].limits): void {
     this.colouring = colouring;
+    this.limits = limits;
     void this.ready.then(() => this.repaint(matchMedia("(prefers-color-scheme: dark)").matches));
   }
 
@@ -148,11 +181,11 @@ export class Atlas {
     if (this.map) attribute(this.map.getContainer(), "blocks", makersOf(this.blocks, this.map.getBounds()));
   }
 
-  /** Show a scene through two models below its outline, until the signal aborts; null without a map. */
-  async compare(pyramids: Pyramids, signal: AbortSignal): Promise<Comparison | null> {
+  /** Show two pictures below the outlines of scenes, until the signal aborts; null without a map. */
+  async compare(pictures: Record<Side, Picture>, signal: AbortSignal): Promise<Comparison | null> {
     await this.ready;
     if (!this.map || signal.aborted) return null;
-    const comparison = new Comparison(this.map, pyramids, "scenes-inside");
+    const comparison = new Comparison(this.map, pictures, "scenes-inside");
     signal.addEventListener("abort", () => comparison.remove());
     return comparison;
   }
@@ -232,7 +265,7 @@ export class Atlas {
   }
 
   private repaint(dark: boolean): void {
-    for (const layer of mapStyle(dark, this.colouring).layers) {
+    for (const layer of mapStyle(dark, this.colouring, this.limits).layers) {
       const paint = Object.entries(layer.paint ?? {}) as [Parameters<MapLibre["setPaintProperty"]>[1], unknown][];
       for (const [name, value] of paint) this.map?.setPaintProperty(layer.id, name, value as never);
     }
@@ -245,8 +278,9 @@ function pointAt(map: MapLibre, x: number, y: number, near: number): number | un
     [x - near, y - near],
     [x + near, y + near],
   ];
-  const [point] = map.queryRenderedFeatures(box, { layers: ["points"] });
-  return point && Number(point.properties["id"]);
+  const [point] = map.queryRenderedFeatures(box, { layers: ["points", "vector-points"] });
+  const id = point?.properties["id"] ?? point?.id;
+  return id === undefined ? undefined : Number(id);
 }
 
 /** Draw the background that the operator has chosen above the land, and name who made it. */

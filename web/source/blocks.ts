@@ -4,8 +4,10 @@ import { type Block, type FeaturePage, get, post, remove } from "./api";
 import type { BlockQuality, StatusInfo } from "./api_types";
 import type { Atlas } from "./atlas";
 import { ask } from "./confirmation";
-import { accuracy, badge, facts, figure, fill, h, plural, problem, when } from "./elements";
+import { accuracy, badge, day, facts, figure, fill, h, plural, problem, when } from "./elements";
+import { listing, type Order } from "./listing";
 import { announce, go } from "./page";
+import { place as placeName } from "./places";
 import { send } from "./upload";
 import type { Place, ShowView } from "./view";
 
@@ -32,11 +34,23 @@ export const showBlocks: ShowView = async (place) => {
     h("h1", { tabindex: -1 }, "Blocks"),
     h("p", {}, "A block is one production of points. It is published and withdrawn as a whole."),
     scopes.includes("admin") ? ingestionForm(place) : null,
-    features.length === 0 ? h("p", { class: "quiet" }, "No blocks yet.") : null,
     features.length < numberMatched ? h("p", { class: "quiet" }, `The first ${features.length} of ${figure(numberMatched)} blocks.`) : null,
-    h("ul", { class: "list" }, ...features.map(row)),
+    listing({ what: "block", rows: features, orders: ORDERS, element: row, empty: h("p", { class: "quiet" }, ...emptyWords(scopes)) }),
   );
 };
+
+const ORDERS: Record<string, Order<Block>> = {
+  "newest first": ({ properties }) => -Date.parse(properties.created_at),
+  name: ({ properties }) => properties.title || properties.id,
+  "most points": ({ properties }) => -properties.n_points,
+  state: ({ properties }) => properties.state,
+};
+
+/** What to do where there is no block. */
+function emptyWords(scopes: string[]): (string | HTMLElement)[] {
+  if (!scopes.includes("admin")) return ["No published blocks yet. An administrator adds one; until then scenes are registered on reference images or on marks."];
+  return ["No blocks yet. Add an archive above, or make one for any region: ", h("code", {}, "amers base make"), ", then ", h("code", {}, "amers block ingest FOLDER --publish"), "."];
+}
 
 /** Shows one block with its quality; administrators publish and withdraw it here. */
 export const showBlock: ShowView = async (place, number) => {
@@ -206,12 +220,13 @@ function names(text: string): string[] {
   return text.split(",").map((name) => name.trim()).filter(Boolean);
 }
 
-function row({ id, properties: block }: Block): HTMLElement {
+function row({ id, geometry, properties: block }: Block): HTMLElement {
+  const area = placeName(geometry);
   return h(
     "li",
     {},
     h("a", { href: `#/block/${id}` }, block.title || block.id),
     badge(block.state),
-    h("span", { class: "quiet" }, `${block.id}@${block.version} · ${plural(block.n_points, "point")}`),
+    h("span", { class: "quiet" }, `${block.id}@${block.version} · ${plural(block.n_points, "point")} · ${day(block.created_at)}`, area ? " · " : null, area),
   );
 }

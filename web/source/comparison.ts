@@ -1,11 +1,13 @@
-// One scene on the map through two models: either of them, or both beside a divider that is moved.
+// Two pictures of the same ground on the map: either of them, or both beside a divider that is moved.
 
+import type { Position } from "geojson";
 import type { CustomLayerInterface, Map as MapLibre } from "maplibre-gl";
 import { h } from "./elements";
+import { colours } from "./style";
 
 export type Bounds = [west: number, south: number, east: number, north: number];
-export type Model = "raw" | "registered";
-export type Shown = Model | "swipe";
+export type Side = "left" | "right";
+export type Shown = Side | "swipe";
 
 export interface Pyramid {
   /** Template of the addresses of its tiles. */
@@ -14,51 +16,81 @@ export interface Pyramid {
   minzoom: number;
   maxzoom: number;
 }
-export type Pyramids = Record<Model, Pyramid>;
+
+/** A small picture at its place on the ground: its corners from the upper left, clockwise. */
+export interface Patch {
+  url: string;
+  corners: [Position, Position, Position, Position];
+}
+
+/** What one side shows: tiles with the edge of their pixels, or patches. */
+export interface Picture {
+  name: string;
+  pyramid?: Pyramid;
+  outline?: Position[];
+  patches?: Patch[];
+}
 
 export const TILE_PX = 256;
+const SIDES: Side[] = ["right", "left"];
 const STEPS = 1000;
 /** Width of the part of the slider that is moved, as in the style sheet. */
 const HANDLE_PX = 44;
 
-/** Raster layers below a layer of the map; left of the divider the raw one, right of it the registered one. */
+/** Layers below a layer of the map; left of the divider those of one side, right of it those of the other. */
 export class Comparison {
   private shown: Shown = "swipe";
-  private readonly slider = h("input", {
-    type: "range",
-    min: 0,
-    max: STEPS,
-    value: STEPS / 2,
-    class: "divider",
-    "aria-label": "Divider between the raw image on the left and the registered image on the right",
-    oninput: () => this.draw(),
-  });
-  private readonly line = h("div", { class: "divider-line", "aria-hidden": "true" }, h("span", {}, "Raw"), h("span", {}, "Registered"));
-  private readonly layers: string[] = [];
+  private opacity = 1;
+  private readonly names = { left: h("span"), right: h("span") };
+  private readonly slider = h("input", { type: "range", min: 0, max: STEPS, value: STEPS / 2, class: "divider", oninput: () => this.draw() });
+  private readonly line = h("div", { class: "divider-line", "aria-hidden": "true" }, this.names.left, this.names.right);
+  private readonly layers: Record<Side, string[]> = { left: [], right: [] };
   private readonly resized = new ResizeObserver(() => this.draw());
 
   constructor(
     private readonly map: MapLibre,
-    pyramids: Pyramids,
+    pictures: Record<Side, Picture>,
     below: string,
   ) {
-    for (const model of ["registered", "raw"] as const) {
-      map.addSource(model, { type: "raster", tileSize: TILE_PX, ...pyramids[model], tiles: [pyramids[model].tiles] });
-      this.add(this.clip(model), below);
-      this.layers.push(model);
-      map.addLayer({ id: model, type: "raster", source: model, paint: { "raster-fade-duration": 0 } }, below);
-    }
-    this.add(this.clip(null), below);
+    for (const side of SIDES) map.addLayer(this.clip(side), below);
+    map.addLayer(this.clip(null), below);
+    for (const side of SIDES) this.replace(side, pictures[side]);
     map.getContainer().append(this.line, this.slider);
     this.resized.observe(map.getContainer());
-    this.show("swipe");
   }
 
-  /** Show one of the models, or both with the divider. */
+  /** Show another picture on one side. */
+  replace(side: Side, picture: Picture): void {
+    this.clear(side);
+    const { name, pyramid, outline, patches = [] } = picture;
+    this.names[side].textContent = name;
+    this.slider.setAttribute("aria-label", `Divider between ${this.names.left.textContent} on the left and ${this.names.right.textContent} on the right`);
+    if (pyramid) {
+      this.map.addSource(side, { type: "raster", tileSize: TILE_PX, ...pyramid, tiles: [pyramid.tiles] });
+      this.add(side, { id: side, type: "raster", source: side, paint: { "raster-fade-duration": 0 } });
+    }
+    patches.forEach(({ url, corners }, at) => {
+      const id = `${side}-${at}`;
+      this.map.addSource(id, { type: "image", url, coordinates: corners as [[number, number], [number, number], [number, number], [number, number]] });
+      this.add(side, { id, type: "raster", source: id, paint: { "raster-fade-duration": 0, "raster-resampling": "nearest" } });
+    });
+    if (outline?.length) {
+      const id = `${side}-outline`;
+      const coordinates = [...outline, outline[0]!];
+      this.map.addSource(id, { type: "geojson", data: { type: "Feature", properties: {}, geometry: { type: "LineString", coordinates } } });
+      const colour = colours(matchMedia("(prefers-color-scheme: dark)").matches).scene;
+      this.add(side, { id, type: "line", source: id, paint: { "line-color": colour, "line-width": 1.6, "line-dasharray": [3, 2] } });
+    }
+    this.show(this.shown);
+    this.fade(this.opacity);
+  }
+
+  /** Show one of the sides, or both with the divider. */
   show(shown: Shown): void {
     this.shown = shown;
-    for (const model of ["raw", "registered"] as const) {
-      this.map.setLayoutProperty(model, "visibility", shown === model || shown === "swipe" ? "visible" : "none");
+    for (const side of SIDES) {
+      const visibility = shown === side || shown === "swipe" ? "visible" : "none";
+      for (const layer of this.layers[side]) this.map.setLayoutProperty(layer, "visibility", visibility);
     }
     this.slider.hidden = this.line.hidden = shown !== "swipe";
     this.draw();
@@ -66,20 +98,35 @@ export class Comparison {
 
   /** Set the opacity of both, 0 to 1. */
   fade(opacity: number): void {
-    for (const model of ["raw", "registered"]) this.map.setPaintProperty(model, "raster-opacity", opacity);
+    this.opacity = opacity;
+    const pictures = SIDES.flatMap((side) => this.layers[side]).filter((layer) => this.map.getLayer(layer)?.type === "raster");
+    for (const layer of pictures) this.map.setPaintProperty(layer, "raster-opacity", opacity);
   }
 
   remove(): void {
     this.resized.disconnect();
     this.slider.remove();
     this.line.remove();
-    for (const layer of this.layers) this.map.removeLayer(layer);
-    for (const model of ["raw", "registered"]) this.map.removeSource(model);
+    for (const side of SIDES) this.clear(side);
+    for (const side of [...SIDES, null]) this.map.removeLayer(clipName(side));
+  }
+
+  private clear(side: Side): void {
+    for (const layer of this.layers[side].splice(0)) {
+      this.map.removeLayer(layer);
+      this.map.removeSource(layer);
+    }
+  }
+
+  private add(side: Side, layer: Parameters<MapLibre["addLayer"]>[0]): void {
+    this.map.addLayer(layer, clipName(side === "right" ? "left" : null));
+    this.layers[side].push(layer.id);
   }
 
   private draw(): void {
     this.line.style.left = `${this.dividerPx()}px`;
-    this.slider.setAttribute("aria-valuetext", `${Math.round((100 * this.slider.valueAsNumber) / STEPS)} % raw`);
+    const share = Math.round((100 * this.slider.valueAsNumber) / STEPS);
+    this.slider.setAttribute("aria-valuetext", `${share} % ${this.names.left.textContent}`);
     this.map.triggerRepaint();
   }
 
@@ -89,24 +136,23 @@ export class Comparison {
     return HANDLE_PX / 2 + (this.slider.valueAsNumber / STEPS) * (clientWidth - HANDLE_PX);
   }
 
-  private add(layer: CustomLayerInterface, below: string): void {
-    this.layers.push(layer.id);
-    this.map.addLayer(layer, below);
-  }
-
   /** A layer that draws nothing: the layers that follow are drawn on one side of the divider only, or everywhere. */
-  private clip(model: Model | null): CustomLayerInterface {
+  private clip(side: Side | null): CustomLayerInterface {
     return {
-      id: `clip-${model ?? "none"}`,
+      id: clipName(side),
       type: "custom",
       render: (gl) => {
-        if (model === null || this.shown !== "swipe") return gl.disable(gl.SCISSOR_TEST);
+        if (side === null || this.shown !== "swipe") return gl.disable(gl.SCISSOR_TEST);
         const { drawingBufferWidth: width, drawingBufferHeight: height } = gl;
         const at = Math.round((this.dividerPx() / this.map.getContainer().clientWidth) * width);
         gl.enable(gl.SCISSOR_TEST);
-        if (model === "raw") gl.scissor(0, 0, at, height);
+        if (side === "left") gl.scissor(0, 0, at, height);
         else gl.scissor(at, 0, width - at, height);
       },
     };
   }
+}
+
+function clipName(side: Side | null): string {
+  return `clip-${side ?? "none"}`;
 }

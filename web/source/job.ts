@@ -1,6 +1,6 @@
 // A job: its progress while it runs, its error if it failed, its report if it was successful.
 
-import type { Feature, FeatureCollection, Point, Polygon, Position } from "geojson";
+import type { Feature, FeatureCollection, Geometry, Point, Polygon, Position } from "geojson";
 import { blobUrl, call, get } from "./api";
 import type { Atlas } from "./atlas";
 import { drawBlocks } from "./blocks";
@@ -10,7 +10,7 @@ import { announce, markSection, pause } from "./page";
 import { ended, find, stateText } from "./processes";
 import type { Criterion, Report } from "./report_types";
 import { imageOnMap } from "./image_on_map";
-import { type PointResultProperties, residualVectors } from "./residuals";
+import { type PointResultProperties, residualArrows, showResidualLegend } from "./residuals";
 import { surfaceOnMap } from "./surface";
 import type { Place, ShowView } from "./view";
 
@@ -24,14 +24,20 @@ export const showJob: ShowView = async (place, id) => {
   const heading = h("h1", { tabindex: -1 }, "Job");
   const body = h("div");
   const back = h("a", { href: "#/scenes" }, "← Scenes");
-  fill(panel, h("p", {}, back), heading, body);
+  const about = h("p", { class: "quiet" });
+  fill(panel, h("p", { class: "state" }, back), heading, about, body);
   let job = await find(id, signal);
   if (job.processID.endsWith("-block")) {
     back.href = "#/blocks";
     back.textContent = "← Blocks";
     markSection("blocks");
   }
-  heading.textContent = job.processID.replace("-", " ").replace(/^./, (first) => first.toUpperCase());
+  const process = job.processID.replaceAll("-", " ").replace(/^./, (first) => first.toUpperCase());
+  const names = job["amers:sceneNames"] ?? [];
+  const scenes = job.links.filter(({ title }) => title === "scene").map(({ href }) => href.split("/").at(-1)!);
+  heading.textContent = names.length > 2 ? `${names[0]} and ${names.length - 1} more scenes` : names.join(", ") || process;
+  about.textContent = `${process} · ${when(job.created)}`;
+  if (names.length === scenes.length) scenes.forEach((scene, at) => back.after(h("a", { href: `#/scene/${scene}` }, `Scene ${names[at]}`)));
   const running = progressOf(job);
   if (!ended(job)) fill(body, running.element);
   while (!ended(job)) {
@@ -40,8 +46,8 @@ export const showJob: ShowView = async (place, id) => {
     job = await find(id, signal);
   }
   announce(`The job is ${job.status}.`);
-  if (job.status === "successful") await showResults(place, job, heading, body);
-  else fill(body, outcome(job), await failureReport(job, signal));
+  if (job.status === "successful") await showResults(place, job, body);
+  else fill(body, outcome(job), await failureReport(job, signal), nextStep(scenes));
 };
 
 function progressOf(first: StatusInfo): { element: HTMLElement; update(job: StatusInfo): void } {
@@ -75,6 +81,12 @@ function outcome(job: StatusInfo): HTMLElement {
   );
 }
 
+/** Where a job that made no result is begun again: at its scene. */
+function nextStep([scene, more]: string[]): HTMLElement | null {
+  if (!scene || more) return null;
+  return h("p", {}, h("a", { class: "button", href: `#/scene/${scene}` }, "Go to the scene"), " ", h("span", { class: "quiet" }, "to register it again, with marks or other options"));
+}
+
 /** A link to the report of a registration that failed, where the job has one. */
 async function failureReport(job: StatusInfo, signal: AbortSignal): Promise<HTMLElement | null> {
   const page = job.links.find(({ title }) => title === "report.html");
@@ -83,7 +95,7 @@ async function failureReport(job: StatusInfo, signal: AbortSignal): Promise<HTML
   return h("p", {}, link, " ", h("span", { class: "quiet" }, "what was tried, and what to try next"));
 }
 
-async function showResults(place: Place, job: StatusInfo, heading: HTMLElement, body: HTMLElement): Promise<void> {
+async function showResults(place: Place, job: StatusInfo, body: HTMLElement): Promise<void> {
   const { atlas, signal } = place;
   const results = await get<Results>(`jobs/${job.jobID}/results`, signal);
   const reportFile = results["report.json"];
@@ -97,15 +109,48 @@ async function showResults(place: Place, job: StatusInfo, heading: HTMLElement, 
     get<Report>(reportFile.href, signal),
     get<FeatureCollection<Point, PointResultProperties>>(pointsFile.href, signal),
   ]);
+  const onMap = await showRegistration(place, report, points);
+  fill(
+    body,
+    ...summary(report),
+    drawingLink(job),
+    imageOnMap(place, { job, report, points, ...onMap }),
+    ...criteria(report),
+    await downloads(results, signal),
+  );
+}
+
+/** Draw the outline, the points and their residuals; what draws the points over an image, or leaves them out. */
+async function showRegistration(
+  { atlas, signal }: Place,
+  report: Report,
+  points: FeatureCollection<Point, PointResultProperties>,
+): Promise<{ overImage: (withPoints: boolean) => void }> {
   const ring = report.scene.footprint_lon_lat as Position[];
   const footprint: Polygon = { type: "Polygon", coordinates: [[...ring, ring[0]!]] };
-  const { features, exaggeration } = residualVectors(points);
-  const held: Feature = { type: "Feature", properties: { status: "held" }, geometry: { type: "MultiPolygon", coordinates: (report.coverage.polygons_lon_lat ?? []) as Position[][][] } };
-  heading.textContent = report.scene.name;
-  fill(body, ...summary(report, exaggeration), drawingLink(job), imageOnMap(place, job, report), ...criteria(report), await downloads(results, signal));
+  const { features, exaggeration } = residualArrows(points);
+  const areas = (report.coverage.polygons_lon_lat ?? []) as Position[][][];
+  const held = (geometry: Geometry): Feature => ({ type: "Feature", properties: { status: "held" }, geometry });
+  const edges = held({ type: "MultiLineString", coordinates: areas.flat() });
+  let legend = new AbortController();
+  const showLegend = (): void => showResidualLegend(atlas, exaggeration, AbortSignal.any([legend.signal, signal]));
   signal.addEventListener("abort", () => void atlas.show("vectors", []));
-  await Promise.all([atlas.show("scenes", [{ type: "Feature", properties: {}, geometry: footprint }]), atlas.show("vectors", [held, ...features])]);
+  void atlas.hidePoints(signal);
+  showLegend();
+  await Promise.all([
+    atlas.show("scenes", [{ type: "Feature", properties: {}, geometry: footprint }]),
+    atlas.show("vectors", [held({ type: "MultiPolygon", coordinates: areas }), ...features]),
+  ]);
   atlas.fit(footprint, 17);
+  return {
+    // The image has outlines of its own, and is not shaded.
+    overImage(withPoints) {
+      legend.abort();
+      legend = new AbortController();
+      if (withPoints) showLegend();
+      void Promise.all([atlas.show("scenes", []), atlas.show("vectors", withPoints ? [edges, ...features] : [])]);
+    },
+  };
 }
 
 /** Draw a block that was ingested, and bring it into view. */
@@ -133,7 +178,7 @@ function blockLink({ number }: Record<string, unknown>): HTMLElement | null {
   return h("p", {}, h("a", { class: "button strong", href: `#/block/${number}` }, "See the block"));
 }
 
-function summary(report: Report, exaggeration: number): (HTMLElement | null)[] {
+function summary(report: Report): (HTMLElement | null)[] {
   const { point_counts: counts, image_residuals_px: px, ground_residuals_m: ground, predicted } = report;
   return [
     h("p", {}, badge(report.verdict), ` Verdict: ${[report.verdict, report.verdict_scope].filter(Boolean).join(", ")}`),
@@ -146,32 +191,44 @@ function summary(report: Report, exaggeration: number): (HTMLElement | null)[] {
       "Residual on the ground, rms": figure(ground.horizontal.rms, "m"),
       "Predicted CE90 relative to the control points, worst place": figure(predicted.worst_px, "px"),
     }),
-    h("p", { class: "legend-line" }, h("span", { class: "swatch vector", "aria-hidden": "true" }), `Residuals on the map, drawn ${figure(exaggeration)} times longer; grey: not used.`),
-    h("p", { class: "quiet" }, `Accuracy is stated for the shaded part of the map, ${figure(report.coverage.percent, "%")} of the image, which the points hold.`),
+    h("p", { class: "quiet" }, `Accuracy is stated for the shaded part of the map (on the image: inside the thin line), ${figure(report.coverage.percent, "%")} of the image, which the points hold.`),
   ];
 }
 
 function criteria({ criteria }: Report): HTMLElement[] {
-  return [
-    h("h2", {}, "Criteria"),
-    h(
-      "table",
-      {},
-      h("thead", {}, h("tr", {}, ...["Criterion", "Value", "Limit", "Met"].map((name) => h("th", { scope: "col" }, name)))),
-      h("tbody", {}, ...criteria.map(criterion)),
-    ),
-  ];
+  const names = [...new Set(criteria.map(({ name }) => name))];
+  const rows = names.map((name) => criterion(criteria.filter((one) => one.name === name)));
+  const heads = ["Criterion", "Value", "Good", "Usable"].map((name) => h("th", { scope: "col" }, name));
+  const table = h("table", { class: "criteria" }, h("thead", {}, h("tr", {}, ...heads)), h("tbody", {}, ...rows));
+  return [h("h2", {}, "Criteria"), h("div", { class: "wide", role: "region", "aria-label": "Criteria", tabindex: 0 }, table)];
 }
 
-function criterion({ label, value, comparison, limit, unit, needed_for, met, calculation }: Criterion): HTMLElement {
+/** A criterion with the limits of both verdicts; it is one thing that is measured, for some at two levels. */
+function criterion(levels: Criterion[]): HTMLElement {
+  const strictest = levels.find(({ needed_for }) => needed_for === "good") ?? levels[0]!;
+  const values = [...new Set(levels.map((one) => decimals(one.value, one)))];
   return h(
     "tr",
-    { title: calculation },
-    h("th", { scope: "row" }, label),
-    h("td", {}, figure(value, unit)),
-    h("td", {}, `${comparison} ${figure(limit, unit)}`),
-    h("td", { class: met ? "" : "missed" }, met ? "yes" : `no, not ${needed_for}`),
+    { title: strictest.calculation },
+    h("th", { scope: "row" }, strictest.label),
+    h("td", {}, values.join(" · ")),
+    limit(levels.find(({ needed_for }) => needed_for === "good")),
+    limit(levels.find(({ needed_for }) => needed_for === "usable")),
   );
+}
+
+/** The limit of a level, and whether it is met; a dash where the level has none. */
+function limit(level: Criterion | undefined): HTMLElement {
+  if (!level) return h("td", { class: "quiet" }, "–");
+  const bound = `${level.comparison === "at least" ? "≥" : "≤"} ${decimals(level.limit, level)}`;
+  return h("td", { class: level.met ? "met" : "missed" }, `${bound} `, h("span", {}, level.met ? "met" : "missed"));
+}
+
+/** A value of a criterion with as many decimals as its unit deserves. */
+function decimals(value: number | null, { decimals: digits, unit }: Criterion): string {
+  if (value == null) return "–";
+  const text = value.toFixed(digits);
+  return unit ? `${text}\u00a0${unit}` : text;
 }
 
 /** Links to the files of the results. The page fetches them, because a plain link cannot send the token. */

@@ -59,6 +59,7 @@ async function route(atlas: Atlas, caller: Caller | null, moved: boolean): Promi
   const [, name = "points", argument = ""] = location.hash.split("/");
   const view = VIEWS[name] ?? VIEWS["points"]!;
   markSection(view.section);
+  document.body.classList.toggle("whole", view.section === "admin");
   panel.scrollTop = 0;
   try {
     await view.show({ panel, atlas, signal, scopes: caller?.scopes ?? [] }, decodeURIComponent(argument));

@@ -4,11 +4,15 @@ import { blobUrl, type FeaturePage, get, type PointOfPage } from "./api";
 import type { PointViewProperties, PointWithViews } from "./api_types";
 import { facts, figure, fill, h, plural, problem } from "./elements";
 import type { Atlas } from "./atlas";
-import { type Colouring, COLOURINGS } from "./style";
+import { CLASSES, type Colouring, COLOURINGS } from "./style";
 import type { ShowView } from "./view";
 
 const LISTED = 50;
 const SETTLED_MS = 250;
+/** Points in view that classes of their accuracy are made of. */
+const SAMPLED = 1000;
+/** Accuracies that differ by less are of one class. */
+const ALIKE = 1.05;
 
 /** Shows the number of points in view of the map, and a list of the first. */
 export const showPoints: ShowView = async ({ panel, atlas, signal }) => {
@@ -21,7 +25,7 @@ export const showPoints: ShowView = async ({ panel, atlas, signal }) => {
     h("p", {}, "Ground positions in three dimensions, each with image chips. Select one on the map or in the list."),
     h("p", { class: "legend-title" }, "Density of the points, when seen from afar"),
     legend(),
-    colouringField(atlas),
+    colouringField(atlas, signal),
     h("h2", {}, "In view"),
     count,
     nothing,
@@ -122,22 +126,48 @@ function legend(): HTMLElement {
 }
 
 /** The choice of what colours the points, with the legend of the classes. */
-function colouringField(atlas: Atlas): HTMLElement {
+function colouringField(atlas: Atlas, signal: AbortSignal): HTMLElement {
   const classes = h("ul", { class: "legend", "aria-label": "Colours of the points" });
   const select = h(
     "select",
-    { id: "colouring", onchange: () => choose(select.value as Colouring) },
+    { id: "colouring", onchange: () => void choose(select.value as Colouring) },
     ...Object.entries(COLOURINGS).map(([name, { label }]) => h("option", { value: name, selected: name === atlas.pointColouring }, label)),
   );
-  const choose = (colouring: Colouring): void => {
-    atlas.pointColouring = colouring;
-    explain(colouring);
+  const choose = async (colouring: Colouring): Promise<void> => {
+    try {
+      if (colouring === "sigma") atlas.colourPoints(colouring, limitsOf(await sigmas(atlas, signal)));
+      else atlas.colourPoints(colouring);
+      explain(colouring);
+    } catch (error) {
+      if (!signal.aborted) fill(classes, h("li", {}, problem(error)));
+    }
   };
   const explain = (colouring: Colouring): void => {
-    const { words } = COLOURINGS[colouring];
+    const words = colouring === "sigma" ? sigmaWords(atlas.pointLimits) : COLOURINGS[colouring].words;
+    const colours = words.length > 4 ? [0, 1, 2, 3, 4] : CLASSES[words.length - 1];
     classes.hidden = words.length === 0;
-    fill(classes, ...words.map((name, at) => h("li", {}, h("span", { class: `swatch class-${at}`, "aria-hidden": "true" }), name)));
+    fill(classes, ...words.map((name, at) => h("li", {}, h("span", { class: `swatch class-${colours![at]}`, "aria-hidden": "true" }), name)));
   };
   explain(atlas.pointColouring);
   return h("div", { class: "colouring" }, h("label", { for: "colouring" }, "Points coloured by"), select, classes);
+}
+
+/** Horizontal standard deviations of points in view, metres, in ascending order. */
+async function sigmas(atlas: Atlas, signal: AbortSignal): Promise<number[]> {
+  const query = new URLSearchParams({ bbox: atlas.bounds().join(","), limit: String(SAMPLED), properties: "sigma_east_m,sigma_north_m" });
+  const { features } = await get<FeaturePage<PointOfPage>>(`collections/points/items?${query}`, signal);
+  return features.map(({ properties }) => Math.hypot(properties.sigma_east_m, properties.sigma_north_m) / Math.SQRT2).sort((one, other) => one - other);
+}
+
+/** Limits between quarters of some values in ascending order, with two digits; fewer where quarters are equal. */
+function limitsOf(values: number[]): number[] {
+  if (!values.length || values.at(-1)! < ALIKE * values[0]!) return [];
+  const quarters = [0.25, 0.5, 0.75].map((share) => Number((values[Math.floor(share * values.length)] ?? 0).toPrecision(2)));
+  return [...new Set(quarters)].filter((limit) => limit > values[0]! && limit <= values.at(-1)!);
+}
+
+function sigmaWords(limits: readonly number[]): string[] {
+  const words = limits.map((limit) => figure(limit, "m"));
+  if (!words.length) return ["all points in view have about the same"];
+  return [`less than ${words[0]}`, ...words.slice(1).map((word, at) => `${words[at]} to ${word}`), `${words.at(-1)} or more`];
 }

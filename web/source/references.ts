@@ -25,7 +25,7 @@ export const showReferences: ShowPart = async ({ content, signal, change }) => {
     referenceForm(),
     references.length
       ? h("ul", { class: "list story", "aria-label": "References" }, ...references.map(row))
-      : h("p", { class: "quiet" }, "No references yet."),
+      : h("p", { class: "quiet" }, "No references yet. Add an ortho-image of the server above: scenes are then registered on it where no block has points."),
   );
 
   function row(reference: Reference): HTMLElement {

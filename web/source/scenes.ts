@@ -5,7 +5,9 @@ import { register, registrationForm } from "./again";
 import { get } from "./api";
 import type { Jobs, Scene, SceneRegistration, Scenes, StatedAccuracy, StatusInfo } from "./api_types";
 import { accuracy, badge, bytes, day, facts, figure, fill, h, problem, when } from "./elements";
+import { listing, type Order } from "./listing";
 import { go } from "./page";
+import { place as placeName } from "./places";
 import { send, uploadBeside } from "./upload";
 import type { Place, ShowView } from "./view";
 
@@ -24,20 +26,45 @@ export const showScenes: ShowView = async (place) => {
     return;
   }
   const [{ scenes }, { jobs }] = await Promise.all([
-    get<Scenes>("scenes?limit=200", signal),
-    get<Jobs>("jobs?limit=20", signal),
+    get<Scenes>(`scenes?limit=${MOST_SCENES}`, signal),
+    get<Jobs>(`jobs?limit=${MOST_JOBS}`, signal),
   ]);
   await atlas.show("scenes", outlines(scenes));
+  if (!atlas.went) atlas.fit({ type: "FeatureCollection", features: outlines(scenes) }, CLOSEST_OF_MANY);
   fill(
     panel,
     h("h1", { tabindex: -1 }, "Scenes"),
     uploadForm(place),
     h("h2", {}, "Jobs"),
-    jobs.length ? h("ul", { class: "list story" }, ...jobs.map(jobRow)) : h("p", { class: "quiet" }, "None yet."),
+    listing({ what: "job", rows: jobs, orders: JOB_ORDERS, element: jobRow, empty: next("No jobs yet. Choose an image above and press Upload and register: the registration is a job.") }),
+    jobs.length === MOST_JOBS ? h("p", { class: "quiet" }, `These are the newest ${MOST_JOBS} jobs. The results of older ones are at their scenes.`) : null,
     h("h2", {}, "My scenes"),
-    scenes.length ? h("ul", { class: "list story" }, ...scenes.map(sceneRow)) : h("p", { class: "quiet" }, "None yet."),
+    listing({ what: "scene", rows: scenes, orders: SCENE_ORDERS, element: sceneRow, empty: next("No scenes yet. Choose an image above, or send one with amers scene register IMAGE --server.") }),
+    scenes.length === MOST_SCENES ? h("p", { class: "quiet" }, `These are the newest ${MOST_SCENES} scenes.`) : null,
   );
 };
+
+const MOST_SCENES = 1000;
+const CLOSEST_OF_MANY = 13;
+const MOST_JOBS = 200;
+
+const SCENE_ORDERS: Record<string, Order<Scene>> = {
+  "newest first": ({ created }) => -Date.parse(created),
+  name: ({ name }) => name,
+  "acquired, newest first": ({ acquired }) => (acquired ? -Date.parse(acquired) : null),
+  "best CE90 on the Earth": ({ registrations: [last] }) => last?.on_the_earth?.ce90_m,
+  "state of the registration": ({ registrations: [last] }) => last?.verdict ?? last?.outcome,
+};
+const JOB_ORDERS: Record<string, Order<StatusInfo>> = {
+  "newest first": ({ created }) => -Date.parse(created),
+  "name of the scene": (job) => job["amers:sceneNames"]?.[0],
+  state: ({ status }) => status,
+  process: ({ processID }) => processID,
+};
+
+function next(words: string): HTMLElement {
+  return h("p", { class: "quiet" }, words);
+}
 
 /** Shows one scene: its state, its registrations with their results, and a form to register it again. */
 export const showScene: ShowView = async ({ panel, atlas, signal }, id) => {
@@ -54,6 +81,7 @@ export const showScene: ShowView = async ({ panel, atlas, signal }, id) => {
     last ? h("p", {}, h("a", { class: "button strong", href: `#/job/${last.job}` }, RESULTS[last.outcome])) : null,
     facts({
       Image: `${scene.file}, ${bytes(scene.size_bytes ?? 0)}`,
+      Place: placeName(scene.footprint),
       Acquired: when(scene.acquired),
       Sensor: scene.sensor,
       "Ground sampling": scene.gsd_m == null ? null : figure(scene.gsd_m, "m"),
@@ -120,7 +148,7 @@ function uploadForm({ signal }: Place): HTMLElement {
 function sceneRow(scene: Scene): HTMLElement {
   const [last] = scene.registrations;
   const date = scene.acquired ? `acquired ${day(scene.acquired)}` : `uploaded ${day(scene.created)}`;
-  return story(h("a", { href: `#/scene/${scene.id}` }, scene.name), states(scene), last ? stated(last) : {}, date);
+  return story(h("a", { href: `#/scene/${scene.id}` }, scene.name), states(scene), last ? stated(last) : {}, date, placeName(scene.footprint));
 }
 
 function registrationRow(one: SceneRegistration): HTMLElement {
@@ -164,12 +192,12 @@ function stated({ relative_to_control_points: relative, on_the_earth: earth }: S
   return { relative_to_control_points: relative ?? undefined, on_the_earth: earth ?? undefined };
 }
 
-/** A row of a list: what it is about, its state, its accuracy, its date. */
-function story(link: HTMLElement, state: (HTMLElement | null)[], figures: Figures, date: string): HTMLElement {
+/** A row of a list: what it is about, its state, its accuracy, its date and its place. */
+function story(link: HTMLElement, state: (HTMLElement | null)[], figures: Figures, date: string, place: HTMLElement | null = null): HTMLElement {
   const { relative_to_control_points: relative, on_the_earth: earth } = figures;
   const known = relative?.ce90_m != null || earth?.ce90_m != null;
   const words = known ? `CE90 ${metres(relative)} relative · ${metres(earth)} on the Earth` : null;
-  return h("li", {}, link, ...state, words ? h("span", { class: "figures" }, words) : null, h("span", { class: "quiet" }, date));
+  return h("li", {}, link, ...state, words ? h("span", { class: "figures" }, words) : null, h("span", { class: "quiet" }, date, place ? " · " : null, place));
 }
 
 /** A CE90 with two significant digits, as the words of the service have it. */

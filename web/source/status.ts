@@ -29,7 +29,7 @@ export const showStatus: ShowPart = async ({ content, signal, change }) => {
       "Damaged files": figure(now.damaged_files),
     }),
     h("h2", {}, "Owners"),
-    owners.length ? h("ul", { class: "list story", "aria-label": "Owners" }, ...owners.map(row)) : h("p", { class: "quiet" }, "No stored data."),
+    owners.length ? h("ul", { class: "list story", "aria-label": "Owners" }, ...owners.map(row)) : h("p", { class: "quiet" }, "No stored data yet: nobody has sent a scene or made a job."),
     h("p", {}, h("button", { type: "button", onclick: () => void change(async () => "The figures are new.") }, "Refresh")),
   );
 };

@@ -23,12 +23,8 @@ const FONT = ["system-ui", "sans-serif"];
 /** What colours the points: classes from the best to the worst, as their tiles have the property. */
 export const COLOURINGS = {
   none: { label: "one colour", property: "", limits: [], words: [] },
-  sigma: {
-    label: "horizontal standard deviation",
-    property: "sigma_horizontal_m",
-    limits: [1, 2, 4],
-    words: ["less than 1 m", "1 m to 2 m", "2 m to 4 m", "4 m or more"],
-  },
+  // Its limits come from the points in view.
+  sigma: { label: "horizontal standard deviation", property: "sigma_horizontal_m", limits: [], words: [] },
   views: { label: "number of views", property: "n_views", limits: [3, 5, 8], words: ["8 or more", "5 to 7", "3 or 4", "1 or 2"] },
   health: {
     label: "health in registrations",
@@ -37,6 +33,8 @@ export const COLOURINGS = {
     words: ["0.95 or more", "0.75 to 0.95", "0.5 to 0.75", "less than 0.5: proposed for suspension", "not tried yet"],
   },
 } as const;
+/** The colours of classes, from the best to the worst, by the number of limits between them. */
+export const CLASSES: Record<number, number[]> = { 0: [0], 1: [0, 3], 2: [0, 1, 3], 3: [0, 1, 2, 3] };
 /** Properties of which more is better. */
 const MORE_IS_BETTER: Colouring[] = ["views", "health"];
 export type Colouring = keyof typeof COLOURINGS;
@@ -86,7 +84,7 @@ export function colours(dark: boolean): typeof LIGHT {
   return dark ? DARK : LIGHT;
 }
 
-export function mapStyle(dark: boolean, colouring: Colouring): StyleSpecification {
+export function mapStyle(dark: boolean, colouring: Colouring, limits: readonly number[] = COLOURINGS[colouring].limits): StyleSpecification {
   const empty = (): GeoJSONSourceSpecification => ({ type: "geojson", data: { type: "FeatureCollection", features: [] } });
   return {
     version: 8,
@@ -110,21 +108,23 @@ export function mapStyle(dark: boolean, colouring: Colouring): StyleSpecificatio
       vectors: empty(),
       marks: empty(),
     },
-    layers: layers(dark, colouring),
+    layers: layers(dark, colouring, limits),
   };
 }
 
-/** The colour of a point: of its class, or one for all. */
-function pointColour(dark: boolean, colouring: Colouring): string | ExpressionSpecification {
+/** The colour of a point: of its class between limits, or one for all. */
+function pointColour(dark: boolean, colouring: Colouring, limits: readonly number[]): string | ExpressionSpecification {
   const { point, classes } = colours(dark);
-  const { property, limits } = COLOURINGS[colouring];
+  const { property } = COLOURINGS[colouring];
   if (!property) return point;
-  const [first, ...rest] = MORE_IS_BETTER.includes(colouring) ? classes.toReversed() : classes;
-  const classed = ["step", ["get", property], first!, ...limits.flatMap((limit, at) => [limit, rest[at]!])] as ExpressionSpecification;
+  const bestFirst = CLASSES[limits.length]!.map((at) => classes[at]!);
+  const [first, ...rest] = MORE_IS_BETTER.includes(colouring) ? bestFirst.toReversed() : bestFirst;
+  const steps = limits.flatMap((limit, at) => [limit, rest[at]!]);
+  const classed = (steps.length ? ["step", ["get", property], first!, ...steps] : ["literal", first!]) as ExpressionSpecification;
   return ["case", ["has", property], classed, colours(dark).quiet];
 }
 
-function layers(dark: boolean, colouring: Colouring): LayerSpecification[] {
+function layers(dark: boolean, colouring: Colouring, limits: readonly number[]): LayerSpecification[] {
   const c = colours(dark);
   const [sparse, enough, dense] = c.densities as [string, string, string];
   return [
@@ -201,7 +201,7 @@ function layers(dark: boolean, colouring: Colouring): LayerSpecification[] {
       filter: ["has", "id"],
       paint: {
         "circle-radius": ["interpolate", ["linear"], ["zoom"], 8, 1.2, 12, 3.2, 16, 5.5],
-        "circle-color": pointColour(dark, colouring),
+        "circle-color": pointColour(dark, colouring, limits),
         "circle-stroke-color": c.halo,
         "circle-stroke-width": ["interpolate", ["linear"], ["zoom"], 10, 0, 13, 1],
       },
@@ -235,7 +235,7 @@ function layers(dark: boolean, colouring: Colouring): LayerSpecification[] {
       source: "vectors",
       filter: ["in", ["geometry-type"], ["literal", ["Point", "MultiPoint"]]],
       paint: {
-        "circle-radius": ["case", ["==", ["get", "status"], "active"], 3.5, 2.5],
+        "circle-radius": ["case", ["has", "residual_east_m"], 2.2, 3.5],
         "circle-color": ["case", ["==", ["get", "status"], "active"], c.active, c.quiet],
         "circle-stroke-color": c.halo,
         "circle-stroke-width": 1,

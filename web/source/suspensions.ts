@@ -13,9 +13,9 @@ export const showSuspensions: ShowPart = async ({ content, signal, change }) => 
     content,
     h("p", {}, "A point is proposed when it fails in many scenes where other points succeed. A suspended point is not served."),
     h("h2", {}, "Proposed"),
-    list("Proposed points", proposed, (point) => act("Suspend", point, suspend)),
+    list("Proposed points", "None. Points are proposed after registrations of several scenes in which they fail.", proposed, (point) => act("Suspend", point, suspend)),
     h("h2", {}, "Suspended"),
-    list("Suspended points", suspended, (point) => act("Reinstate", point, reinstate)),
+    list("Suspended points", "None. A proposed point that you suspend is listed here.", suspended, (point) => act("Reinstate", point, reinstate)),
   );
 
   function inState(state: string): Promise<FeaturePage<PointHistory>> {
@@ -48,8 +48,8 @@ function act(word: string, point: PointHistory, on: (point: PointHistory) => Pro
   return h("button", { type: "button", "aria-label": `${word} point ${point.id}`, onclick: () => void on(point) }, word);
 }
 
-function list(name: string, { features, numberMatched }: FeaturePage<PointHistory>, button: (point: PointHistory) => HTMLElement): HTMLElement {
-  if (!features.length) return h("p", { class: "quiet" }, "None.");
+function list(name: string, empty: string, { features, numberMatched }: FeaturePage<PointHistory>, button: (point: PointHistory) => HTMLElement): HTMLElement {
+  if (!features.length) return h("p", { class: "quiet" }, empty);
   const rows = h("ul", { class: "list story", "aria-label": name }, ...features.map((point) => row(point, button(point))));
   return features.length < numberMatched
     ? h("div", {}, h("p", { class: "count" }, `${plural(numberMatched, "point")}, the worst ${features.length}:`), rows)
