@@ -1,5 +1,6 @@
 """The page of the API: its operations with their parameters, out of the OpenAPI description."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -7,6 +8,7 @@ from fastapi import Request
 from fastapi.responses import HTMLResponse
 
 from amers.app.api.pages import Page, document_page
+from amers.app.api.try_out import TRY_OUTS
 
 BOUNDS = {
     "minimum": "at least {}",
@@ -18,6 +20,31 @@ BOUNDS = {
     "maxItems": "at most {} of them",
     "default": "default {}",
 }
+
+
+GROUPS = {
+    "features": ("Features", "Points, blocks, density and scenes, by box, time, condition and order."),
+    "points": ("One point", "A point with all its properties, its chips, and its suspension."),
+    "collections": (
+        "Collections",
+        "What the service has, and the properties that a condition may name.",
+    ),
+    "tiles": ("Tiles", "Vector tiles of points and density, and images of scenes and surfaces."),
+    "blocks": ("Blocks", "Upload, publication, withdrawal, quality and deletion of blocks of points."),
+    "scenes": ("Scenes", "Images with their sensor models, and files beside them."),
+    "uploads": ("Resumable uploads", "Large files in pieces, by the protocol tus 1.0."),
+    "processes": ("Processes", "What the service computes, with the inputs of each process."),
+    "jobs": ("Jobs", "Computations that were asked for: their states, messages and results."),
+    "stac": ("STAC", "Scenes with their verdicts as items of a catalogue."),
+    "references": ("References", "Ortho-images on which scenes are registered without control points."),
+    "tokens": ("Tokens", "Callers of the service, what they may do and what they keep."),
+    "operations": (
+        "Operation",
+        "Figures for monitoring, the state of the installation, the audit trail.",
+    ),
+    "system": ("Service", "The first page, the classes of the standards, and health."),
+}
+"""Title and words of each group of requests, by its tag, in the order of the page."""
 
 
 @dataclass(frozen=True)
@@ -56,19 +83,35 @@ class Operation:
     replies: str
 
 
+@dataclass(frozen=True)
+class Group:
+    """Operations about one subject."""
+
+    title: str
+    text: str
+    operations: list[Operation]
+
+
 def operations_page(request: Request, document: dict[str, Any]) -> HTMLResponse:
     """The description of the API for people, operations in groups."""
-    groups: dict[str, list[Operation]] = {}
+    found: dict[str, list[Operation]] = {}
     for path, operations in document["paths"].items():
         for method, operation in operations.items():
             tag = operation.get("tags", ["other"])[0]
-            groups.setdefault(tag, []).append(_operation(method, path, operation))
+            found.setdefault(tag, []).append(_operation(method, path, operation))
+    groups = {tag: Group(*GROUPS.get(tag, (tag, "")), found[tag]) for tag in _in_order(found)}
     info = document["info"]
     links = [
         {"rel": "service-desc", "href": f"{request.base_url}api", "title": "As OpenAPI, for programs"}
     ]
     page = Page(f"{info['title']} {info['version']}", info["description"], links)
-    return document_page(request, page, "api.html", groups=groups)
+    return document_page(request, page, "api.html", groups=groups, try_outs=TRY_OUTS)
+
+
+def _in_order(tags: Iterable[str]) -> list[str]:
+    """The tags in the order of `GROUPS`; others come last."""
+    order = list(GROUPS)
+    return sorted(tags, key=lambda tag: order.index(tag) if tag in GROUPS else len(order))
 
 
 def _operation(method: str, path: str, operation: dict[str, Any]) -> Operation:

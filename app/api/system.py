@@ -25,6 +25,7 @@ from amers.app.api.operations_page import operations_page
 from amers.app.api.pages import Cell, Page, document_page
 from amers.app.api.public_address import address_state, log_wrong_address
 from amers.app.api.routes import CallerRoute
+from amers.app.api.try_out import TRY_OUTS
 from amers.app.usecases.readiness import Readiness, overall
 
 router = APIRouter(tags=["system"], route_class=CallerRoute)
@@ -104,7 +105,8 @@ def landing(*, request: Request, f: Format = None) -> Response:
             )
         )
     pages = {link.title: link for link in links if not link.rel.startswith("http")}
-    return document_page(request, Page(title, description, list(pages.values())))
+    page = Page(title, description, list(pages.values()))
+    return document_page(request, page, "landing.html", try_outs=TRY_OUTS)
 
 
 @router.get(

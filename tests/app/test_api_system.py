@@ -6,6 +6,7 @@ from fastapi.testclient import TestClient
 
 from amers.app.api import error_responses
 from amers.app.api.deps import Admin, DatabaseDep, PointsReader, Reader, Registrar
+from amers.app.api.try_out import TRY_OUTS
 from amers.app.db import engine
 from amers.app.errors import (
     AmersError,
@@ -120,6 +121,22 @@ def test_the_page_of_the_api_has_all_operations_with_their_parameters(client):
     items = page.partition("GET /collections/points/items</code>")[2].partition("</details>")[0]
     assert "a token with scope read" in items
     assert "at least 1; at most" in items, "the bounds of limit"
+
+
+@pytest.mark.parametrize("path", ["/?f=html", "/api?f=html"])
+def test_every_form_of_a_page_sends_a_request_that_the_service_answers(client, bearer, path):
+    """As a browser sends it: all fields of the form in the query, without a script."""
+    reply = client.get(path)
+    assert "<script" not in reply.text
+    assert "form-action 'self'" in reply.headers["content-security-policy"]
+    assert reply.text.count('<form method="get"') == len(TRY_OUTS)
+    for form in TRY_OUTS:
+        assert f"{client.base_url}/{form.path}" in reply.text
+        choices = {field.name: [value for value, _ in field.choices] for field in form.fields}
+        asked = {field.name: field.value for field in form.fields}
+        for kind in choices["f"]:
+            tried = client.get(f"/{form.path}", params=asked | {"f": kind}, headers=bearer("read"))
+            assert tried.status_code == 200, (form.id, kind, tried.text)
 
 
 @pytest.mark.parametrize("path", ["/scope/read", "/scope/register", "/scope/admin", "/scope/points"])

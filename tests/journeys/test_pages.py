@@ -10,7 +10,7 @@ from playwright.sync_api import Browser, expect
 from tests.app.flat_world import FlatWorld
 from tests.command_line import amers_here
 from tests.journeys.conftest import Amers
-from tests.journeys.map_page import assert_readable
+from tests.journeys.map_page import assert_readable, tab_to
 from tests.service_process import Service, installed_at
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
@@ -55,6 +55,26 @@ def test_a_page_of_the_service_is_readable(name, browser: Browser, service: Serv
         page.goto(f"{service.url}{PAGES[name]}")
         expect(page.get_by_role("heading", level=1)).to_be_visible()
         assert_readable(page, f"page-{name}")
+
+
+@pytest.mark.parametrize("name", ["landing", "api"])
+def test_a_request_is_tried_with_the_keyboard_alone(
+    name, browser: Browser, service: Service, world, secret
+):
+    """From the page to a table of points, with nothing from another site."""
+    with browser.new_context(http_credentials={"username": "any", "password": secret}) as context:
+        asked: list[str] = []
+        context.on("request", lambda request: asked.append(request.url))
+        page = context.new_page()
+        page.goto(f"{service.url}{PAGES[name]}")
+        tab_to(page, "Box")
+        page.keyboard.press("ControlOrMeta+a")
+        page.keyboard.type("-10,35,30,60")
+        tab_to(page, "Send the request")
+        page.keyboard.press("Enter")
+        expect(page.get_by_role("table")).to_be_visible()
+        assert "bbox=-10" in page.url
+        assert all(url.startswith(service.url) for url in asked)
 
 
 def test_the_page_of_a_point_and_the_form_to_sign_in_are_readable(
