@@ -34,6 +34,10 @@ FORMULA = re.compile(
     r'<(?P<tag>span|div) class="arithmatex">\\(?P<open>[(\[])(?P<latex>.*?)\\[)\]]</(?P=tag)>', re.DOTALL
 )
 
+FOR_READERS, FOR_PROGRAMMERS = 4.0, 0.25
+"""Weights in the search of the site: pages that answer questions, and references and records."""
+ANSWERS = re.compile(r"(guide|questions|inputs|connect|limits|operations|glossary|methods/.*)\.md")
+
 SHARED = re.compile(
     r"^(?P<indent> +)(?P<names>\w+(?:,\s+\w+)+): (?P<text>.*(?:\n(?P=indent) +.*)*)", re.MULTILINE
 )
@@ -109,7 +113,9 @@ def listings(source: str) -> str:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Turn links to files of the repository into links that the site can follow."""
+    """Turn links to files of the repository into links that the site can follow; weigh the page."""
+    is_answer = ANSWERS.fullmatch(page.file.src_uri)
+    page.meta["search"] = {"boost": FOR_READERS if is_answer else FOR_PROGRAMMERS}
     names = {name: source for source, name in PAGES.items()}
     here = names.get(page.file.src_uri, f"docs/{page.file.src_uri}")
     if page.file.src_uri.startswith("library/"):
