@@ -25,8 +25,9 @@ from scipy.optimize import least_squares as scipy_least_squares
 from scipy.spatial import cKDTree
 
 from amers.services.adjustment.block_gauge import Gauge
+from amers.services.adjustment.block_parts import Weights, block_parts
 from amers.services.adjustment.block_problem import BlockOptions, BlockProblem
-from amers.services.adjustment.block_solution import State, least_squares
+from amers.services.adjustment.block_solution import State, least_squares, normals
 from amers.services.adjustment.bundle import adjust_block
 from amers.services.adjustment.control_ground import NO_CONTROL
 from amers.services.adjustment.normal_equations import Equations
@@ -101,10 +102,15 @@ def beside_ceres(n_images: int) -> dict[str, Any]:
     # Ceres knows no gauge: here the observations tell all they seem to.
     rows = len(start.values) * priors.size
     free = Gauge(np.zeros(n_images, dtype=np.int64), *(np.zeros((rows, c)) for c in (3, 0, 0)))
-    weight = np.ones(len(observations))
-    least_squares(problem, priors, free, start, weight)
+    weights = Weights(np.ones(len(observations)), np.empty(0))
+
+    def solved() -> State:
+        parts = block_parts(problem)
+        return least_squares(parts, priors, free, normals(parts, start.place, weights)).state
+
+    solved()
     begun = time.process_time()
-    state = least_squares(problem, priors, free, start, weight).state
+    state = solved()
     outcome: dict[str, Any] = {
         "images": n_images,
         "points": len(truth),

@@ -94,7 +94,7 @@ class Work:
 
     def results(
         self, stage: str, function: Callable[..., Arrays], arguments: Sequence[tuple[Any, ...]]
-    ) -> list[Arrays]:
+    ) -> list[dict[str, Any]]:
         """The results of short tasks in their order, which are not kept.
 
         Args:
@@ -102,14 +102,16 @@ class Work:
             function: as in `run`.
             arguments: of every task.
         """
+        return self.each(stage, function, [partial(tuple, one) for one in arguments])
+
+    def each(
+        self, stage: str, function: Callable[..., Arrays], tasks: Sequence[Callable[[], tuple[Any, ...]]]
+    ) -> list[dict[str, Any]]:
+        """As `results`, of tasks whose arguments are made when each begins."""
         here = replace(self, kept={})
-        names = [f"{stage}/{number}" for number in range(len(arguments))]
-
-        def given(number: int) -> tuple[Any, ...]:
-            return arguments[number]
-
-        here.run(function, [(name, partial(given, number)) for number, name in enumerate(names)])
-        return [here.kept[name] for name in names]
+        names = [f"{stage}/{number}" for number in range(len(tasks))]
+        here.run(function, list(zip(names, tasks, strict=True)))
+        return [dict(here.kept.pop(name)) for name in names]
 
     def _keep_ended(self, pending: dict[Future[tuple[Arrays, float]], str]) -> int:
         ended = wait(pending, return_when=FIRST_COMPLETED).done

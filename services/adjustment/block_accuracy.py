@@ -12,7 +12,8 @@ from amers.services.adjustment.parameters import (
     PASS_SHARE,
     AdjustableImage,
     BlockPriors,
-    sharing_covariance,
+    own_part,
+    shared_part,
     shift_rows,
 )
 from amers.services.adjustment.reduced_system import ReducedSystem
@@ -47,6 +48,17 @@ class BlockAccuracy:
         """Of the parameters (n k,), with the doubt about the frame."""
         own = np.diagonal(self.relative[self.pairs.start[:-1]], 0, 1, 2).ravel()
         return np.asarray(own + ((self.move @ self.frame_m2) * self.move).sum(axis=1))
+
+    @property
+    def followed(self) -> Array:
+        """Change (n, k, 3) of all parameters when their own group moves by a metre."""
+        # Each image belongs to one group.
+        own = self.move.reshape(len(self.move), -1, 3).sum(axis=1)
+        return np.asarray(own.reshape(len(self.pairs.start) - 1, -1, 3))
+
+    def frames_m2(self, group: IntArray) -> Array:
+        """Covariances (p, 3, 3) of the frames of points of given groups (p,)."""
+        return np.stack(_of_groups(self.frame_m2))[group]
 
 
 def _of_pairs(pairs: Pairs, move: Array, frame_m2: Array) -> Array:
@@ -156,7 +168,7 @@ def earth_frames(
         tie: images in common with an adjusted block.
     """
     common = np.zeros(len(images), dtype=np.bool_) if tie is None else tie.members(len(images))
-    gain = accuracy.frame_m2 @ (priors.locating @ accuracy.move).T
+    gain = accuracy.frame_m2 @ priors.located(accuracy.move).T
     doubted = accuracy.frame_m2.copy()
     beside = np.zeros_like(doubted)
     for both in passes:
@@ -165,15 +177,14 @@ def earth_frames(
             continue
         rows = shift_rows(images, members, priors.size)
         weighted = gain[:, rows]
-        none, half, full = (sharing_covariance(images, members, s) for s in (0.0, PASS_SHARE, 1.0))
-        doubted += weighted @ (none - half) @ weighted.T
-        doubted += positive_part(weighted @ (full - none) @ weighted.T)
+        shared = shared_part(images, members, weighted)
+        doubted += positive_part(shared) - PASS_SHARE * shared
         if (both & common).any():
-            beside += weighted @ full @ weighted.T
+            beside += own_part(images, members, weighted) + shared
     if tie is not None and beside.any():
         own = tie.parameter_rows(priors.size)
         weighted = gain[:, own]
-        carried = weighted @ np.linalg.solve(priors.locating[np.ix_(own, own)].toarray(), weighted.T)
+        carried = weighted @ np.linalg.solve(priors.apart[np.ix_(own, own)].toarray(), weighted.T)
         together = np.linalg.inv(doubted)
         share = np.sqrt(np.trace(together @ beside) / np.trace(together @ carried))
         doubted += share * carried + beside / share
@@ -186,20 +197,24 @@ def _of_groups(covariance: Array) -> list[Array]:
 
 
 def carried_covariances(
-    equations: Equations, points: Points, accuracy: BlockAccuracy, group: IntArray
+    equations: Equations, points: Points, pairs: Pairs, accuracy: tuple[Array, Array, Array]
 ) -> Array:
     """What images add to the covariances of points, relative to their frames: (p, 3, 3).
 
-    The other part is that of a point's own rays; this one neighbours share. With `group` (p,) of the
-    points, and how far
-    T a point goes when its group moves by a metre, nearly the unit matrix, the frame F adds
-    (T - I) F (T - I)^T.
+    The other part is that of a point's own rays; this one neighbours share. With how far T a point goes
+    when its group moves by a metre, nearly the unit matrix, the frame F adds (T - I) F (T - I)^T.
+
+    Args:
+        equations: at the solution.
+        points: eliminated from them.
+        pairs: of blocks that have a point in common.
+        accuracy: (s, k, k) `BlockAccuracy.relative` of them, (n, k, 3) `BlockAccuracy.followed`, and
+            (p, 3, 3) of the frame of each point.
     """
-    # Each image belongs to one group.
-    of_group = accuracy.move.reshape(len(accuracy.move), -1, 3).sum(axis=1)
-    added, carried = shared_covariance(equations, points, accuracy.pairs, accuracy.relative, of_group)
+    relative, followed, frame_m2 = accuracy
+    of_group = followed.reshape(-1, 3)
+    added, carried = shared_covariance(equations, points, pairs, relative, of_group)
     turned = carried - np.eye(3)
-    frame_m2 = np.stack(_of_groups(accuracy.frame_m2))[group]
     carried_m2 = added + turned @ frame_m2 @ turned.transpose(0, 2, 1)
     return np.asarray((carried_m2 + carried_m2.transpose(0, 2, 1)) / 2.0)
 

@@ -8,8 +8,7 @@ from numba import njit
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from amers.services.adjustment.normal_equations import Equations, common_pairs
-from amers.services.geodesy import continuous
+from amers.services.adjustment.normal_equations import Equations, Pairs
 from amers.services.types import Array, BoolArray, IntArray
 
 MIN_COMMON = 3
@@ -33,28 +32,32 @@ class Gauge:
     basis: Array
 
 
-def connected_groups(equations: Equations, n_images: int, n_blocks: int) -> IntArray:
+def connected_groups(pairs: Pairs, common: IntArray, n_images: int) -> IntArray:
     """Group (n,) of images and frames of control that points tie together; -1 for the unseen.
 
     A frame whose points no image shows belongs to no group.
+
+    Args:
+        pairs: of blocks of parameters.
+        common: (s,) pairs of observations of one point that they have.
+        n_images: blocks of images; frames are behind.
     """
-    used = equations.weight > 0.0
-    keys, common = common_pairs(equations.point[used], equations.block[used], n_blocks)
-    first, second = keys // n_blocks, keys % n_blocks
-    tied = np.where(second < n_images, common >= MIN_COMMON, first < n_images)
+    n_blocks = len(pairs.start) - 1
+    first, second = np.repeat(np.arange(n_blocks), np.diff(pairs.start)), pairs.other
+    tied = np.where(second < n_images, common >= MIN_COMMON, (first < n_images) & (common > 0))
     graph = sparse.coo_matrix((np.ones(tied.sum()), (first[tied], second[tied])), (n_blocks, n_blocks))
-    count, label = connected_components(graph, directed=False)
-    seen = np.bincount(equations.block[used], minlength=n_blocks) > 0
+    _, label = connected_components(graph, directed=False)
+    seen = common[pairs.start[:-1]] > 0
     seen &= np.isin(label, label[:n_images][seen[:n_images]])
-    number = np.full(count, -1)
-    for i in np.flatnonzero(seen):
-        if number[label[i]] < 0:
-            number[label[i]] = number.max() + 1
+    # Groups are numbered in the order of their first members.
+    of_seen, first_member = np.unique(label[seen], return_index=True)
+    number = np.full(n_blocks, -1)
+    number[of_seen[np.argsort(first_member)]] = np.arange(len(of_seen))
     return np.where(seen, number[label], -1).astype(np.int64)
 
 
 def block_gauge(
-    equations: Equations, group: IntArray, lon_lat_h: Array, deformable: BoolArray, sigma: Array
+    group: IntArray, own: Array, followed: Array, deformable: BoolArray, sigma: Array
 ) -> Gauge:
     """The effect of translations and linear deformations of each group on its parameters.
 
@@ -65,22 +68,16 @@ def block_gauge(
     together has the same effect, and only relief, seen under different angles, shows the difference.
 
     Args:
-        equations: the observations.
         group: (n,) of every block of parameters.
-        lon_lat_h: (p, 3) the points.
+        own, followed: (n, k, k) and (n, k, 9), `followed_ground`.
         deformable: (n,) blocks of parameters that follow linear deformations. A group does when all of
             its members do: known ground tells how it is deformed.
+        sigma: (n, k) a priori standard deviations.
     """
-    n, groups = len(group), int(group.max()) + 1
-    used = equations.weight > 0.0
-    east_north = continuous(lon_lat_h[equations.point[used], :2])
-    east_north -= east_north.mean(axis=0)
-    place = np.zeros((len(used), 2))
-    place[used] = east_north / (2.0 * east_north.std(axis=0) + 1e-12)
-    normal, right = _sums(equations, place, n)
-    told = np.maximum((np.diagonal(normal, 0, 1, 2) * sigma**2).sum(axis=1), 1e-300)
+    groups = int(group.max()) + 1
+    told = np.maximum((np.diagonal(own, 0, 1, 2) * sigma**2).sum(axis=1), 1e-300)
     ridge = 1e-9 * told[:, None] * sigma**-2.0
-    change = np.linalg.solve(normal + ridge[:, :, None] * np.eye(normal.shape[1]), right)
+    change = np.linalg.solve(own + ridge[:, :, None] * np.eye(own.shape[1]), followed)
     move, *linear = np.split(change, 3, axis=2)
     of_groups = np.stack([group == g for g in range(groups)])
     bends = [members for members in of_groups if deformable[members].all()]
@@ -90,7 +87,7 @@ def block_gauge(
 
 
 @njit(cache=True)
-def _sums(equations: Equations, place: Array, n: int) -> tuple[Array, Array]:
+def followed_ground(equations: Equations, place: Array, n: int) -> tuple[Array, Array]:
     """Normal matrices (n, k, k) and right sides (n, k, 9) of the parameters that follow the ground best.
 
     It moves by a metre east, north and up; then by so much times each coordinate of the place (m, 2).

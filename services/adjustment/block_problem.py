@@ -3,8 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from amers.services.adjustment.control_ground import ControlGround
 from amers.services.adjustment.known_images import Tie
@@ -13,6 +15,8 @@ from amers.services.adjustment.parameters import AdjustableImage
 from amers.services.geodesy import metres_per_degree_at, wrapped_degrees
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.types import Array, BoolArray, IntArray, Observations
+
+T = TypeVar("T", bound=np.generic)
 
 
 @dataclass(frozen=True)
@@ -253,11 +257,11 @@ class BlockProblem:
         difference[:, :2] *= metres_per_degree_at(np.nan_to_num(computed))
         return np.asarray(difference - values[len(self.images) + self.control.source, :3])
 
-    def image_rows(self, per_row: Array) -> Array:
+    def image_rows(self, per_row: npt.NDArray[T]) -> npt.NDArray[T]:
         """What belongs to the m image positions, of values of the list."""
         return np.asarray(per_row[self.place[: len(self.observations)]])
 
-    def control_rows(self, per_row: Array) -> Array:
+    def control_rows(self, per_row: npt.NDArray[T]) -> npt.NDArray[T]:
         """What belongs to the c control points, (c, 2, ...), of values of the list."""
         rows = self.place[len(self.observations) :]
         return np.asarray(per_row[rows].reshape(len(self.control), 2, *per_row.shape[1:]))

@@ -7,11 +7,12 @@ import numpy as np
 
 from amers.services.adjustment.block_accuracy import (
     BlockAccuracy,
-    carried_covariances,
     earth_frames,
     joint_relative,
 )
+from amers.services.adjustment.block_parts import Parts, block_parts
 from amers.services.adjustment.block_problem import BlockOptions, BlockProblem
+from amers.services.adjustment.block_solution import point_covariances
 from amers.services.adjustment.control_check import check_place_of_control
 from amers.services.adjustment.control_ground import NO_CONTROL, ControlGround
 from amers.services.adjustment.known_images import KnownImages, known_images, tie
@@ -21,6 +22,7 @@ from amers.services.adjustment.robust_start import robust_start, started
 from amers.services.adjustment.settled_block import Round, Weighing, settled
 from amers.services.errors import InputError, NoConsensus, UndeterminedCorrection
 from amers.services.sensors.base import SensorModel
+from amers.services.tasks import Work
 from amers.services.types import Array, BoolArray, Frame, IntArray, Observations
 
 
@@ -81,6 +83,7 @@ def adjust_block(
     passes: Sequence[BoolArray] = (),
     options: BlockOptions = BlockOptions(),
     like: BlockAdjustment | None = None,
+    work: Work | None = None,
 ) -> BlockAdjustment:
     """The parameters of every image for which the rays of the points intersect, on the known ground.
 
@@ -100,6 +103,7 @@ def adjust_block(
         options: thresholds.
         like: an adjustment of these images on these observations and others, whose scale and drifts
             hold: all observations are used, and none leaves.
+        work: computes the parts of a large block (`block_parts`); by default in this process.
 
     Raises:
         InputError: the neighbour has no image of the block, or one with another model; control points
@@ -119,10 +123,11 @@ def adjust_block(
     n_points = int(observations.point[-1]) + 1 if len(observations) else 0
     problem = BlockProblem(images, observations, control, options, n_points, priors.size, tied)
     _check_heights(problem)
+    parts = block_parts(problem, work, (priors.apart.data, priors.shared.data, priors.mean))
     try:
-        start = _start(problem, priors, like)
+        start = _start(parts, priors, like)
         _check_control(control, start.control_active)
-        return _stated(problem, settled(problem, start, once=like is not None), passes)
+        return _stated(parts, settled(parts, start, once=like is not None), passes)
     except np.linalg.LinAlgError:
         raise UndeterminedCorrection(
             f"{len(images)} images and {len(control)} control points leave the place of the block open: "
@@ -131,14 +136,15 @@ def adjust_block(
         ) from None
 
 
-def _start(problem: BlockProblem, priors: BlockPriors, like: BlockAdjustment | None) -> Weighing:
+def _start(parts: Parts, priors: BlockPriors, like: BlockAdjustment | None) -> Weighing:
     """A robust solution, or all observations on what an adjustment of more of them has found."""
+    problem = parts.problem
     if like is None:
         check_place_of_control(problem, problem.start_values())
-        state, scale, active, control_active = robust_start(problem, priors)
+        state, scale, active, control_active = robust_start(parts, priors)
         return Weighing(state, priors, scale, 1.0, active, control_active)
     return Weighing(
-        started(problem, like.values),
+        started(parts, like.values),
         priors.with_slopes(like.slope_factor),
         like.sigma_px,
         like.slope_factor,
@@ -147,25 +153,29 @@ def _start(problem: BlockProblem, priors: BlockPriors, like: BlockAdjustment | N
     )
 
 
-def _stated(problem: BlockProblem, last: Round, passes: Sequence[BoolArray]) -> BlockAdjustment:
+def _stated(parts: Parts, last: Round, passes: Sequence[BoolArray]) -> BlockAdjustment:
     """What the last least squares state of images, points and frames."""
+    problem = parts.problem
     images, observations, control = problem.images, problem.observations, problem.control
     solved, state, accuracy, group = last.solved, last.solved.state, last.accuracy, last.gauge.group
     used = last.before.active
     control_active = _shown_control(control, observations.point[used], last.before.control_active)
     of_points = np.full(problem.n_points, -1)
     of_points[observations.point[used][::-1]] = group[observations.image[used][::-1]]
-    carried_m2 = carried_covariances(solved.equations, solved.points, accuracy, of_points)
-    intersected = (of_points >= 0) & np.isfinite(solved.points.inverse[:, 0, 0])
-    relative_m2 = solved.points.inverse + carried_m2
+    carried_m2, relative_m2, residual_px = point_covariances(
+        parts, solved.normals, state.place, accuracy, of_points
+    )
+    residual_px *= observations.sigma_px[:, None]
+    intersected = (of_points >= 0) & solved.normals.determined
     on_earth = earth_frames(accuracy, solved.system.priors, images, passes, problem.tie)
     frames = tuple(
         replace(frame, shared_m2=carried_m2[intersected & (of_points == number)].mean(axis=0))
         for number, frame in enumerate(on_earth)
     )
-    residual_px = problem.image_rows(problem.equations(state.values, state.lon_lat_h).residual)
     lon_lat_h = state.lon_lat_h.copy()
     lon_lat_h[:, 0] -= 360.0 * np.round(lon_lat_h[:, 0] / 360.0)
+    for of_point in (lon_lat_h, carried_m2, relative_m2):
+        of_point[~intersected] = np.nan
     of_control_m = problem.control_misfit_m(state.values, state.lon_lat_h)
     return BlockAdjustment(
         models=tuple(
@@ -176,13 +186,13 @@ def _stated(problem: BlockProblem, last: Round, passes: Sequence[BoolArray]) -> 
         determined=last.determined.reshape(state.values.shape)[: len(images)],
         accuracy=accuracy,
         slope_factor=last.before.slope_factor,
-        lon_lat_h=np.where(intersected[:, None], lon_lat_h, np.nan),
-        point_covariance_m2=np.where(intersected[:, None, None], relative_m2, np.nan),
-        point_shared_m2=np.where(intersected[:, None, None], carried_m2, np.nan),
+        lon_lat_h=lon_lat_h,
+        point_covariance_m2=relative_m2,
+        point_shared_m2=carried_m2,
         group=group[: len(images)],
         known=_known(images, state.values, group, frames, of=(solved.system, accuracy)),
         frames=frames,
-        residual_px=residual_px * observations.sigma_px[:, None],
+        residual_px=residual_px,
         active=used & intersected[observations.point],
         control_active=control_active,
         control_misfit_m=np.where(control.known, of_control_m, np.nan),

@@ -4,12 +4,11 @@ import numpy as np
 from numba import njit
 from scipy.special import chdtri
 
-from amers.services.adjustment.block_accuracy import BlockAccuracy
 from amers.services.adjustment.block_problem import BlockProblem
-from amers.services.adjustment.block_solution import State
 from amers.services.adjustment.normal_equations import Equations, Pairs, Points, eliminated, pair_row
 from amers.services.errors import InputError
 from amers.services.misfit.robust import CAUCHY_TUNING
+from amers.services.tasks import Arrays
 from amers.services.types import Array, BoolArray, IntArray
 
 _AGREES = 0.9999
@@ -54,9 +53,7 @@ def check_place_of_control(problem: BlockProblem, values: Array) -> None:
         )
 
 
-def robust_control(
-    problem: BlockProblem, equations: Equations, weight: Array
-) -> tuple[Array, BoolArray]:
+def robust_control(problem: BlockProblem, square: Array) -> tuple[Array, BoolArray]:
     """Weights (c,) of control points while the block moves, and whether (c,) they are near the others.
 
     Misfits are relative to the sigmas of the known ground and of the rays, in units of their own median:
@@ -64,49 +61,63 @@ def robust_control(
 
     Args:
         problem: the block.
-        equations: at the current state.
-        weight: (m,) of the image positions.
+        square: (c,) of the misfits, `control_sizes`.
     """
     if not len(problem.control):
         return np.ones(0), np.ones(0, dtype=np.bool_)
-    alone = equations._replace(weight=problem.weights(weight, np.zeros(len(problem.control))))
-    rays = eliminated(alone, problem.n_points).inverse[problem.control.point]
+    freedom = problem.control.known_coordinates()
+    near = square <= chdtri(freedom, 1.0 - _AGREES) * _NEAR**2
+    return robust_weights(np.sqrt(square / freedom)), near
+
+
+def robust_weights(size: Array) -> Array:
+    """Cauchy weights (s,) of sizes in units of their median: all may be far off at first."""
+    if not len(size):
+        return np.ones(0)
+    scale = max(1.0, float(np.median(size)))
+    return np.asarray(1.0 / (1.0 + (size / (CAUCHY_TUNING * scale)) ** 2) / scale**2)
+
+
+def control_sizes(problem: BlockProblem, equations: Equations) -> Array:
+    """Squares (c,) of the misfits of control points, in units of their sigmas and of those of the rays.
+
+    Args:
+        problem: the block.
+        equations: at the current state, without weights of the control.
+    """
+    rays = eliminated(equations, problem.n_points).inverse[problem.control.point]
     # Points of one ray follow their known ground: they do not contradict it.
     rays = np.where(np.isfinite(rays), rays, 1e12 * np.eye(3))
     halves = problem.control_rows(equations.by_ground).reshape(-1, 4, 3)
     residual = problem.control_rows(equations.residual).reshape(-1, 4)
     spread = np.eye(4) + halves @ rays @ halves.transpose(0, 2, 1)
-    square = (residual * np.linalg.solve(spread, residual[:, :, None])[:, :, 0]).sum(axis=1)
-    freedom = problem.control.known_coordinates()
-    size = np.sqrt(square / freedom)
-    scale = max(1.0, float(np.median(size)))
-    near = square <= chdtri(freedom, 1.0 - _AGREES) * _NEAR**2
-    return 1.0 / (1.0 + (size / (CAUCHY_TUNING * scale)) ** 2) / scale**2, near
+    return np.asarray((residual * np.linalg.solve(spread, residual[:, :, None])[:, :, 0]).sum(axis=1))
 
 
-def robust_single_rays(problem: BlockProblem, state: State, equations: Equations) -> Array:
-    """Weights (s,) of the only rays of known points (`BlockProblem.single_rays`) while the block moves.
+def single_ray_sizes(
+    problem: BlockProblem, values: Array, lon_lat_h: Array, equations: Equations
+) -> Array:
+    """Sizes (s,) of the residuals of the only rays of known points (`BlockProblem.single_rays`).
 
-    Residuals are those at the known ground, in units of their own median: the images may be far off.
+    They are those at the known ground, in units of the sigmas of both.
 
     Args:
         problem: the block.
-        state: parameters and points.
-        equations: at this state.
+        values: (n, k) parameters.
+        lon_lat_h: (p, 3) points.
+        equations: there.
     """
     rows, known = problem.single_rays
     if not len(rows):
-        return np.ones(0)
+        return np.empty(0)
     row = problem.place[rows]
-    misfit_m = problem.control_misfit_m(state.values, state.lon_lat_h)[known]
+    misfit_m = problem.control_misfit_m(values, lon_lat_h)[known]
     by_ground = equations.by_ground[row]
     residual = equations.residual[row] - (by_ground @ misfit_m[:, :, None])[:, :, 0]
     ground_m2 = problem.control.covariance_m2[known]
     spread = np.eye(2) + by_ground @ ground_m2 @ by_ground.transpose(0, 2, 1)
     square = (residual * np.linalg.solve(spread, residual[:, :, None])[:, :, 0]).sum(axis=1)
-    size = np.sqrt(square / 2.0)
-    scale = max(1.0, float(np.median(size)))
-    return np.asarray(1.0 / (1.0 + (size / (CAUCHY_TUNING * scale)) ** 2) / scale**2)
+    return np.asarray(np.sqrt(square / 2.0))
 
 
 def ray_coordinates(problem: BlockProblem, equations: Equations, points: Points) -> Array:
@@ -123,34 +134,44 @@ def ray_coordinates(problem: BlockProblem, equations: Equations, points: Points)
     return coordinates
 
 
-def agreeing_control(
-    problem: BlockProblem,
-    equations: Equations,
-    points: Points,
-    accuracy: BlockAccuracy,
-    active: BoolArray,
-) -> BoolArray:
+def predicted_control(
+    problem: BlockProblem, equations: Equations, points: Points, pairs: Pairs, covariance: Array
+) -> Arrays:
+    """What the solution tells of every control point.
+
+    Args:
+        problem: the block.
+        equations: at the solution.
+        points: eliminated from them.
+        pairs: of blocks that have a point in common.
+        covariance: (s, k, k) of their parameters.
+
+    Returns:
+        Its `halves` (c, 4, 3) and `residual` (c, 4) in units of its sigmas, and the `predicted`
+        covariance (c, 3, 3) of its computed ground with the error of its frame.
+    """
+    place = np.column_stack([problem.control.point, len(problem.images) + problem.control.source])
+    return {
+        "halves": problem.control_rows(equations.by_ground).reshape(-1, 4, 3),
+        "residual": problem.control_rows(equations.residual).reshape(-1, 4),
+        "predicted": _predicted_covariance(equations, points, pairs, covariance, place),
+    }
+
+
+def agreeing_control(freedom: IntArray, told: Arrays, active: BoolArray) -> BoolArray:
     """The control points (c,) that agree, after the worst has left or the best has come back.
 
     The misfit of a point is judged by its own covariance and by that of what all others predict: a point
     that takes part has drawn the block towards itself.
 
     Args:
-        problem: the block.
-        equations: at the solution.
-        points: eliminated from them.
-        accuracy: of the parameters.
+        freedom: (c,) known coordinates of each.
+        told: what the solution tells of each, `predicted_control`.
         active: (c,) that took part in the solution.
     """
-    if not len(problem.control):
+    if not len(active):
         return active
-    covariance = accuracy.covariance()
-    frame = len(problem.images) + problem.control.source
-    place = np.column_stack([problem.control.point, frame])
-    predicted = _predicted_covariance(equations, points, problem.pairs, covariance, place)
-    halves = problem.control_rows(equations.by_ground).reshape(-1, 4, 3)
-    residual = problem.control_rows(equations.residual).reshape(-1, 4)
-    freedom = problem.control.known_coordinates()
+    halves, residual, predicted = told["halves"], told["residual"], told["predicted"]
     limit = chdtri(freedom, 1.0 - _AGREES)
     ratio = np.full(len(active), np.inf)
     for i in range(len(active)):

@@ -52,6 +52,18 @@ class ControlGround:
             out[i][inside] = (vectors / np.sqrt(np.maximum(values, _EXACT_M**2))).T
         return out
 
+    def take(self, rows: IntArray) -> "ControlGround":
+        """The known positions of the given rows, in that order, with all frames."""
+        return ControlGround(
+            self.point[rows],
+            self.lon_lat_h[rows],
+            self.covariance_m2[rows],
+            self.source[rows],
+            self.frames,
+            tuple(self.names[row] for row in rows.tolist()),
+            self.is_by_hand[rows],
+        )
+
     @property
     def is_by_hand(self) -> BoolArray:
         """(c,) points that people marked in the images."""
@@ -80,7 +92,7 @@ class ControlGround:
 
     def known_coordinates(self) -> IntArray:
         """Number (c,) of coordinates that are known."""
-        return self.known.sum(axis=1).astype(np.int64)
+        return np.asarray(self.known.sum(axis=1), dtype=np.int64)
 
 
 def joined_ground(parts: Sequence[ControlGround]) -> ControlGround:

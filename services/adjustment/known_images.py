@@ -125,13 +125,13 @@ class Tie:
         free = np.ones(len(priors.shape))
         free[rows] = 0.0
         at = [np.repeat(rows, len(rows)), np.tile(rows, len(rows))]
-        told = sparse.coo_matrix((weight.ravel(), at), priors.locating.shape)
+        told = sparse.coo_matrix((weight.ravel(), at), priors.apart.shape)
         kept = sparse.diags(free)
         mean = priors.mean.copy()
         mean[rows] = self.known.values.ravel()
         return replace(
             priors,
-            locating=(kept @ priors.locating @ kept + told).tocsc(),
+            apart=(kept @ priors.apart @ kept + told).tocsc(),
             shape=priors.shape * free,
             mean=mean,
         )

@@ -266,17 +266,34 @@ class BlockPriors:
 
     Attributes:
         size: parameters of the image that has most; those that others lack have no derivative.
-        locating: (K, K) sparse, inverse covariance of the parameters that tell where images lie.
+        apart: (K, K) sparse, `locating` plus the squares of the columns `shared`: no pass ties images.
+        shared: (K, q) sparse, the errors that the images of a pass share, in blocks of `size` columns
+            for every pass.
         shape: (K,) inverse variances of the others: drifts and skews.
         estimated: (K,) parameters that the block determines.
         mean: (K,) what is expected: 0, or what a neighbouring block tells.
     """
 
     size: int
-    locating: sparse.csc_matrix
+    apart: sparse.csc_matrix
+    shared: sparse.csc_matrix
     shape: Array
     estimated: BoolArray
     mean: Array
+
+    @cached_property
+    def locating(self) -> sparse.csc_matrix:
+        """(K, K) sparse, inverse covariance of the parameters that tell where images lie."""
+        return (self.apart - self.shared @ self.shared.T).tocsc()
+
+    def located(self, columns: Array) -> Array:
+        """The product (K, ...) of `locating` with columns, without the pairs of images of passes."""
+        return np.asarray(self.apart @ columns - self.shared @ (self.shared.T @ columns))
+
+    def weight(self) -> Array:
+        """(K,) inverse a priori variances, for known values of all other parameters."""
+        square = np.asarray(self.shared.power(2).sum(axis=1)).ravel()
+        return np.asarray(self.apart.diagonal() - square + self.shape)
 
     def with_slopes(self, factor: float) -> "BlockPriors":
         """The same where the standard deviations that are estimated are multiplied by a factor."""
@@ -296,7 +313,7 @@ def block_priors(
     size = max([len(image.sigma) for image in images] + [3] * bool(frames))
     n = len(images) + len(frames)
     # Parameters that an image lacks keep a unit weight, so that the matrix has an inverse.
-    locating, shape = sparse.lil_matrix((n * size, n * size)), np.zeros(n * size)
+    apart, shape = sparse.lil_matrix((n * size, n * size)), np.zeros(n * size)
     estimated = np.zeros(n * size, dtype=np.bool_)
     for i, image in enumerate(images):
         k = len(image.sigma)
@@ -305,19 +322,46 @@ def block_priors(
         tells = np.ones(size, dtype=np.bool_)
         tells[:k] = image.locating
         rows = i * size + np.arange(size)
-        locating[rows, rows] = np.where(tells, weight, 0.0)
+        apart[rows, rows] = np.where(tells, weight, 0.0)
         shape[rows] = np.where(tells, 0.0, weight)
         estimated[rows[:k]] = image.estimated
+    shared = [sparse.csc_matrix((n * size, 0))]
     for members in passes:
-        rows = shift_rows(images, members, size)
-        covariance = sharing_covariance(images, members, PASS_SHARE)
-        locating[np.ix_(rows, rows)] = np.linalg.inv(covariance)
+        own, columns = _shared_columns([images[i] for i in np.flatnonzero(members).tolist()])
+        for i, alone in zip(np.flatnonzero(members).tolist(), own, strict=True):
+            rows = i * size + np.flatnonzero(images[i].locating)
+            apart[np.ix_(rows, rows)] = alone
+        # Blocks of columns, as others are of parameters.
+        of_pass = sparse.lil_matrix((n * size, size * -(-columns.shape[1] // size)))
+        of_pass[shift_rows(images, members, size), : columns.shape[1]] = columns
+        shared.append(of_pass.tocsc())
     for i, covariance in enumerate(frames):
         rows = (len(images) + i) * size + np.arange(3)
-        locating[np.ix_(rows, rows)] = frame_weight(covariance)
+        apart[np.ix_(rows, rows)] = frame_weight(covariance)
         rest = np.arange(rows[-1] + 1, (len(images) + i + 1) * size)
-        locating[rest, rest] = 1.0
-    return BlockPriors(size, locating.tocsc(), shape, estimated, np.zeros(n * size))
+        apart[rest, rest] = 1.0
+    columns = sparse.hstack(shared).tocsc()
+    return BlockPriors(size, apart.tocsc(), columns, shape, estimated, np.zeros(n * size))
+
+
+def _shared_columns(images: Sequence[AdjustableImage]) -> tuple[list[Array], Array]:
+    """Weights B^-1 of every image, and columns C (s, q) of a pass.
+
+    The inverse covariance of its parameters is B^-1 - C C^T; their covariance is that of each image
+    alone, B, plus D D^T / 2 of the errors D that all share.
+    """
+    own: list[Array] = []
+    weighted: list[Array] = []
+    told: Array = np.zeros((1, 1))
+    for image in images:
+        direction = image.shared_direction()
+        alone = np.diag(image.sigma[image.locating] ** 2) - PASS_SHARE * direction @ direction.T
+        own.append(np.asarray(np.linalg.inv(alone), dtype=np.float64))
+        weighted.append(own[-1] @ direction)
+        told = told + direction.T @ weighted[-1]
+    inner = np.linalg.cholesky(np.eye(len(told)) / PASS_SHARE + told)
+    columns = np.linalg.solve(inner, np.concatenate(weighted).T).T
+    return own, np.asarray(columns, dtype=np.float64)
 
 
 def frame_weight(covariance_m2: Array) -> Array:
@@ -339,15 +383,27 @@ def shift_rows(images: Sequence[AdjustableImage], members: BoolArray, size: int)
     return np.concatenate(rows)
 
 
-def sharing_covariance(images: Sequence[AdjustableImage], members: BoolArray, share: float) -> Array:
-    """Covariance (s, s) of the locating parameters of a pass, of which images have a share in common."""
+def shared_part(images: Sequence[AdjustableImage], members: BoolArray, gain: Array) -> Array:
+    """What the errors that a pass may share add to the covariance of a frame, if all are shared: (g, g).
+
+    The covariance of the locating parameters of its images is diagonal, plus the share times the
+    products of the shared errors of every two of them.
+
+    Args:
+        images: of the block.
+        members: (n,) images of the pass.
+        gain: (g, s) of the frame, by the locating parameters of its images in their order.
+    """
+    total, own, first = np.zeros((len(gain), 1)), np.zeros((len(gain), len(gain))), 0
+    for i in np.flatnonzero(members).tolist():
+        direction = images[i].shared_direction()
+        moved = gain[:, first : first + len(direction)] @ direction
+        total, own, first = total + moved, own + moved @ moved.T, first + len(direction)
+    return np.asarray(total @ total.T - own)
+
+
+def own_part(images: Sequence[AdjustableImage], members: BoolArray, gain: Array) -> Array:
+    """What the errors of the images of a pass add to the covariance of a frame where none is shared."""
     chosen = [images[i] for i in np.flatnonzero(members).tolist()]
-    directions = np.concatenate([image.shared_direction() for image in chosen])
-    covariance = share * directions @ directions.T
-    first = 0
-    for image in chosen:
-        sigma = image.sigma[image.locating]
-        own = np.s_[first : first + len(sigma)]
-        covariance[own, own] = np.diag(sigma**2)
-        first += len(sigma)
-    return np.asarray(covariance)
+    sigma = np.concatenate([image.sigma[image.locating] for image in chosen])
+    return np.asarray((gain * sigma**2) @ gain.T)

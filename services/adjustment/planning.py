@@ -8,13 +8,12 @@ import numpy as np
 from amers.services.adjustment.block_accuracy import (
     BlockAccuracy,
     block_accuracy,
-    carried_covariances,
     earth_frames,
 )
+from amers.services.adjustment.block_parts import Place, Weights, block_parts
 from amers.services.adjustment.block_problem import BlockOptions, BlockProblem
-from amers.services.adjustment.block_solution import checked_gauge
+from amers.services.adjustment.block_solution import checked_gauge, normals, point_covariances
 from amers.services.adjustment.control_ground import NO_CONTROL, ControlGround
-from amers.services.adjustment.normal_equations import eliminated, reduced
 from amers.services.adjustment.parameters import AdjustableImage, block_priors
 from amers.services.adjustment.reduced_system import reduced_system
 from amers.services.errors import NotEnoughPoints
@@ -100,11 +99,11 @@ def predicted_block(
     rays = np.bincount(observations.point, minlength=len(lon_lat_h))
     known = control.point[control.known[:, :2].all(axis=1)]
     counted = rays + np.isin(np.arange(len(rays)), known) >= 2
-    weight = problem.weights(counted[observations.point], np.ones(len(control)))
-    values = np.zeros((problem.n_blocks, priors.size))
-    equations = problem.equations(values, lon_lat_h, weight)
-    points = eliminated(equations, problem.n_points)
-    determined = np.isfinite(points.inverse[:, 0, 0]) & counted & (rays >= 1)
+    at = Place(np.zeros((problem.n_blocks, priors.size)), lon_lat_h)
+    parts = block_parts(problem)
+    weights = Weights(counted[observations.point].astype(np.float64), np.ones(len(control)))
+    found = normals(parts, at, weights)
+    determined = found.determined & counted & (rays >= 1)
     if determined.sum() < options.min_points:
         raise NotEnoughPoints(
             int(determined.sum()),
@@ -112,14 +111,13 @@ def predicted_block(
             f"points that two of {len(images)} images show, or one and known ground: more overlap, "
             "denser points, or heights are needed",
         )
-    gauge = checked_gauge(problem, equations, lon_lat_h)
-    system = reduced_system(reduced(equations, points, problem.pairs)[0], problem.pairs, priors, gauge)
-    accuracy = block_accuracy(system, problem.pairs, gauge, len(images) * priors.size)
+    gauge = checked_gauge(parts, found)
+    system = reduced_system(found.normal, parts.pairs, priors, gauge, lambda: parts.dissection)
+    accuracy = block_accuracy(system, parts.pairs, gauge, len(images) * priors.size)
     group = np.full(len(lon_lat_h), -1)
     group[observations.point[::-1]] = gauge.group[observations.image[::-1]]
     group[~determined] = -1
-    carried_m2 = carried_covariances(equations, points, accuracy, group)
-    relative_m2 = points.inverse + carried_m2
+    relative_m2 = point_covariances(parts, found, at, accuracy, group)[1]
     return PredictedBlock(
         point_covariance_m2=np.where(determined[:, None, None], relative_m2, np.nan),
         group=group,

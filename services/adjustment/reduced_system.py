@@ -1,21 +1,25 @@
 """The reduced normal matrix of a block: dense for some hundred images, sparse for thousands."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve, lapack
-from scipy.sparse.linalg import SuperLU, splu
 
 from amers.services.adjustment.block_gauge import Gauge
+from amers.services.adjustment.dissection import Dissection
 from amers.services.adjustment.normal_equations import Pairs
 from amers.services.adjustment.parameters import BlockPriors
-from amers.services.adjustment.selected_inverse import selected_inverse
 from amers.services.types import Array
 
 DENSE_ROWS = 2000
 """Largest matrix that is solved densely."""
+_TRACE = 1e-150
+"""In place of zero: nothing beside any weight, and far above the smallest number."""
+_AT_ONCE = 10_000
+"""Pairs whose products are in memory together."""
 
 
 @dataclass(frozen=True)
@@ -30,16 +34,13 @@ class ReducedSystem:
         observed: (K, K) sparse, N.
         priors: P and S.
         gauge: what H and G remove.
+        dissection: solves large systems.
     """
 
     observed: sparse.csc_matrix
     priors: BlockPriors
     gauge: Gauge
-
-    @cached_property
-    def _whole(self) -> sparse.csc_matrix:
-        """N + S + P."""
-        return (self.observed + sparse.diags(self.priors.shape) + self.priors.locating).tocsc()
+    dissection: Callable[[], Dissection]
 
     @cached_property
     def _removed(self) -> tuple[Array, Array]:
@@ -58,26 +59,19 @@ class ReducedSystem:
         basis, moves, off = self.gauge.basis, self.gauge.moves, at - self.priors.mean
         shape = self.priors.shape * off
         observed = observed - basis @ (basis.T @ observed)
-        return np.asarray(observed - shape + moves @ (moves.T @ shape) - self.priors.locating @ off)
+        return np.asarray(observed - shape + moves @ (moves.T @ shape) - self.priors.located(off))
 
     def dense(self) -> Array:
         """The matrix (K, K)."""
         left, right = self._removed
-        return np.asarray(self._whole.toarray() - left @ right.T)
+        priors = np.diag(self.priors.shape) + self.priors.locating.toarray()
+        return np.asarray(self.observed.toarray() + priors - left @ right.T)
 
     def times(self, columns: Array) -> Array:
         """The product (K, c) with columns."""
         left, right = self._removed
-        return np.asarray(self._whole @ columns - left @ (right.T @ columns))
-
-    @cached_property
-    def _factor(self) -> SuperLU:
-        return splu(
-            self._whole,
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
+        priors = self.priors.shape[:, None] * columns + self.priors.located(columns)
+        return np.asarray(self.observed @ columns + priors - left @ (right.T @ columns))
 
     def solve(self, right: Array) -> Array:
         """The solution (K,)."""
@@ -85,7 +79,7 @@ class ReducedSystem:
             return np.asarray(cho_solve(cho_factor(self.dense()), right))
         # Woodbury for the few columns of the gauge.
         left, other = self._removed
-        solved = self._factor.solve(np.column_stack([right, left]))
+        solved = self._sparse(np.column_stack([right, left]))[0]
         inner = np.eye(left.shape[1]) - other.T @ solved[:, 1:]
         return np.asarray(solved[:, 0] + solved[:, 1:] @ np.linalg.solve(inner, other.T @ solved[:, 0]))
 
@@ -96,14 +90,30 @@ class ReducedSystem:
             inverse = self.dense_inverse(root).reshape(len(root) // k, k, -1, k)
             return np.asarray(inverse[first, :, pairs.other])
         left, other = (np.hstack(part) for part in zip(self._removed, (-root, root), strict=True))
-        solved, other_solved = self._factor.solve(left), self._factor.solve(other)
+        both, blocks = self._sparse(np.hstack([left, other]), pairs)
+        solved, other_solved = np.hsplit(both, 2)
         inner = np.linalg.inv(np.eye(left.shape[1]) - other.T @ solved)
-        blocks = selected_inverse(self._factor, pairs, k)
-        one, two = (
-            (solved @ inner).reshape(-1, k, left.shape[1]),
-            other_solved.reshape(-1, k, left.shape[1]),
-        )
-        return np.asarray(blocks + one[first] @ two[pairs.other].transpose(0, 2, 1))
+        one, two = (part.reshape(-1, k, left.shape[1]) for part in (solved @ inner, other_solved))
+        for rows in np.array_split(np.arange(len(first)), 1 + len(first) // _AT_ONCE):
+            blocks[rows] += one[first[rows]] @ two[pairs.other[rows]].transpose(0, 2, 1)
+        return blocks
+
+    def _sparse(self, columns: Array, pairs: Pairs | None = None) -> tuple[Array, Array]:
+        """Solution (K, c) of N + S + P, and blocks (s, k, k) of its inverse.
+
+        The errors that passes share are unknowns of their own, so that no pass ties all of its images.
+        """
+        dissection, shared = self.dissection(), self.priors.shared
+        count, beside = columns.shape[0], shared.shape[1]
+        whole = (self.observed + self.priors.apart + sparse.diags(self.priors.shape)).tocsc()
+        if beside:
+            errors = sparse.identity(beside)
+            whole = sparse.bmat([[whole, shared], [shared.T, errors]]).tocsc()
+        nowhere = np.full((beside // dissection.size, 2), np.nan)
+        augmented = replace(dissection, place=np.vstack([dissection.place, nowhere]))
+        right = np.vstack([columns, np.zeros((beside, columns.shape[1]))])
+        solution, blocks = augmented.solution(whole, right, pairs)
+        return solution[:count], blocks
 
     def dense_inverse(self, root: Array) -> Array:
         """The whole inverse (K, K) of the matrix and the squares of columns (K, c) together."""
@@ -118,7 +128,13 @@ def _dense_inverse(matrix: Array) -> Array:
     return np.asarray(np.tril(inverse) + np.tril(inverse, -1).T)
 
 
-def reduced_system(values: Array, pairs: Pairs, priors: BlockPriors, gauge: Gauge) -> ReducedSystem:
+def reduced_system(
+    values: Array,
+    pairs: Pairs,
+    priors: BlockPriors,
+    gauge: Gauge,
+    dissection: Callable[[], Dissection],
+) -> ReducedSystem:
     """The system of blocks (s, k, k) of the normal matrix.
 
     Args:
@@ -126,14 +142,17 @@ def reduced_system(values: Array, pairs: Pairs, priors: BlockPriors, gauge: Gaug
         pairs: rows of `values`.
         priors: of the parameters.
         gauge: of the block.
+        dissection: returns what solves large systems.
     """
     n, k = len(pairs.start) - 1, priors.size
-    first, second, ordered = np.repeat(np.arange(n), np.diff(pairs.start)), pairs.other, values
-    apart = first != second
-    rows = np.concatenate([first, second[apart]])
-    columns = np.concatenate([second, first[apart]])
-    blocks = np.concatenate([ordered, ordered[apart].transpose(0, 2, 1)])
-    row = (rows[:, None, None] * k + np.arange(k)[:, None]) + np.zeros((1, 1, k), dtype=np.int64)
-    column = (columns[:, None, None] * k + np.arange(k)[None, :]) + np.zeros((1, k, 1), dtype=np.int64)
-    observed = sparse.coo_matrix((blocks.ravel(), (row.ravel(), column.ravel())), (n * k, n * k))
-    return ReducedSystem(observed.tocsc(), priors, gauge)
+    first = np.repeat(np.arange(n), np.diff(pairs.start))
+    apart = np.flatnonzero(first != pairs.other)
+    rows = np.concatenate([first, pairs.other[apart]])
+    columns = np.concatenate([pairs.other, first[apart]])
+    order = np.lexsort((columns, rows))
+    # Entries of zero have entries of the inverse; SuperLU would leave them out.
+    values = np.where(values == 0.0, _TRACE, values)
+    blocks = np.concatenate([values, values[apart].transpose(0, 2, 1)])[order]
+    start = np.searchsorted(rows[order], np.arange(n + 1))
+    observed = sparse.bsr_matrix((blocks, columns[order], start), shape=(n * k, n * k))
+    return ReducedSystem(observed.tocsc(), priors, gauge, dissection)

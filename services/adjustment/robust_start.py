@@ -1,7 +1,11 @@
 """The robust solution of a block, of which a third of the observations may be wrong."""
 
+from dataclasses import replace
+from typing import NamedTuple
+
 import numpy as np
 
+from amers.services.adjustment.block_parts import Parts, Place, Weights, joined, same
 from amers.services.adjustment.block_problem import BlockProblem
 from amers.services.adjustment.block_scale import (
     LEAST_SCALE,
@@ -10,20 +14,20 @@ from amers.services.adjustment.block_scale import (
     magnitude,
     robust_scale,
 )
-from amers.services.adjustment.block_solution import State, checked_gauge, moved, step, unsettled
-from amers.services.adjustment.control_check import robust_control, robust_single_rays
-from amers.services.adjustment.normal_equations import RobustTerms, robust_points
+from amers.services.adjustment.block_solution import State, checked_gauge, normals, step, unsettled
+from amers.services.adjustment.control_check import robust_control, robust_weights
 from amers.services.adjustment.parameters import BlockPriors
+from amers.services.adjustment.part_tasks import control_part, robust_part
 from amers.services.errors import NotEnoughPoints
+from amers.services.geodesy import move_metres
 from amers.services.types import Array, BoolArray
 
+_STAGE = "robust"
 _NEARLY_PX = 0.02
 """Change of the parameters at which least squares take over."""
 
 
-def robust_start(
-    problem: BlockProblem, priors: BlockPriors
-) -> tuple[State, float, BoolArray, BoolArray]:
+def robust_start(parts: Parts, priors: BlockPriors) -> tuple[State, float, BoolArray, BoolArray]:
     """The robust solution: state, scale of the observations, observations and control that agree.
 
     The scale of the Cauchy weights falls from what the images may be off to the smallest residuals, by
@@ -34,46 +38,96 @@ def robust_start(
         NoConsensus: the residuals are too large for the sigmas of the observations.
         NoConvergence: the parameters still change after the last iteration.
     """
-    point, n = problem.observations.point, len(problem.images)
+    problem = parts.problem
+    point = problem.observations.point
     state = State(problem.start_values(), problem.start())
     scale, change_px = _falling_scale(problem), np.inf
     falling = scale
-    alone = np.isin(np.arange(len(point)), problem.single_rays[0])
+    if (kept := parts.kept(_STAGE)) is not None:
+        state = State(kept["values"], kept["lon_lat_h"], int(kept["iterations"]))
+        change_px, falling = float(kept["change_px"]), float(kept["falling"])
+        scale = float(kept["scale"])
     while True:
-        equations = problem.equations(state.values, state.lon_lat_h)
-        step_m, weight = robust_points(equations, n, _terms(problem, state, max(scale, falling)))
-        _check_points(problem, step_m)
-        equations, state = moved(equations, state, step_m)
-        square = problem.image_rows((equations.residual**2).sum(axis=1))
-        square = np.where(np.isfinite(step_m[point, 0]) | alone, square, np.nan)
-        measured = np.where(problem.by_hand, np.nan, square)
+        rays = _robust_rays(parts, state.place, max(scale, falling))
+        measured = np.where(problem.by_hand, np.nan, rays.square)
         scale = max(low_scale(measured, point, problem.ray_coordinates), LEAST_SCALE)
-        weight = problem.image_rows(weight * (equations.weight > 0)) / max(scale, falling) ** 2
-        weight[problem.single_rays[0]] = robust_single_rays(problem, state, equations)
-        control_weight, near = robust_control(problem, equations, weight)
+        weight = rays.weight / max(scale, falling) ** 2
+        weight[problem.single_rays[0]] = robust_weights(rays.single)
+        weights, near = _with_control(parts, rays.at, weight)
         if change_px <= _NEARLY_PX and falling <= scale:
             break
         if state.iterations == problem.options.max_iterations:
             raise unsettled(problem, change_px, state)
-        equations = equations._replace(weight=problem.weights(weight, control_weight))
-        gauge = checked_gauge(problem, equations, state.lon_lat_h, refuse=False)
-        solved = step(problem, priors, gauge, state, equations)
+        before = normals(parts, rays.at, weights)
+        gauge = checked_gauge(parts, before, refuse=False)
+        solved = step(parts, priors, gauge, before, state.iterations)
         state, change_px = solved.state, solved.change_px
         falling *= 0.5
+        parts.keep(_STAGE, **vars(state), change_px=change_px, falling=falling, scale=scale)
     scale = max(robust_scale(measured, point, problem.ray_coordinates), LEAST_SCALE)
     check_scale(scale)
-    small = square <= (problem.options.tolerance * problem.scales(scale)) ** 2
-    active = active_observations(problem, square, small, scale, near)
-    return state, scale, active, near
+    small = rays.square <= (problem.options.tolerance * problem.scales(scale)) ** 2
+    active = active_observations(problem, rays.square, small, scale, near)
+    return rays.state(state.iterations), scale, active, near
 
 
-def started(problem: BlockProblem, values: Array) -> State:
+class _Rays(NamedTuple):
+    """The robust intersections of all points.
+
+    Attributes:
+        at: where points were, and how far they have moved.
+        weight: (m,) of the image positions, for a scale of one.
+        square: (m,) of their residuals; NaN where unusable.
+        single: (s,) sizes of the residuals of the only rays of known points.
+    """
+
+    at: Place
+    weight: Array
+    square: Array
+    single: Array
+
+    def state(self, iterations: int) -> State:
+        """The state with the moved points."""
+        step_m = np.zeros_like(self.at.lon_lat_h) if self.at.step_m is None else self.at.step_m
+        return State(self.at.values, move_metres(self.at.lon_lat_h, step_m), iterations)
+
+
+def _robust_rays(parts: Parts, at: Place, scale: float) -> _Rays:
+    problem = parts.problem
+    found = parts.each(robust_part, parts.at(at), same(scale))
+    determined = joined(parts.points, found, "determined")
+    _check_points(problem, int(determined.sum()))
+    single = problem.single_rays[0]
+    usable = determined[problem.observations.point]
+    usable[single] = True
+    square = joined(parts.observations, found, "square")
+    return _Rays(
+        at._replace(step_m=joined(parts.points, found, "step_m")),
+        joined(parts.observations, found, "weight"),
+        np.where(usable, square, np.nan),
+        joined(parts.observations, found, "single")[single],
+    )
+
+
+def _with_control(parts: Parts, at: Place, weight: Array) -> tuple[Weights, BoolArray]:
+    """Weights (m,) of image positions with those of the control, and whether it is near (c,)."""
+    square = np.empty(0)
+    if len(parts.problem.control):
+        without = Weights(weight, np.zeros(len(parts.problem.control)))
+        found = parts.each(control_part, parts.at(at), parts.of_weights(without))
+        square = joined(parts.control, found, "square")
+    of_control, near = robust_control(parts.problem, square)
+    return Weights(weight, of_control), near
+
+
+def started(parts: Parts, values: Array) -> State:
     """The state with known parameters (n, k) of the images, and points where most of their rays meet."""
+    problem = parts.problem
     state = State(problem.start_values(), problem.start())
     state.values[: len(values), : values.shape[1]] = values
-    equations = problem.equations(state.values, state.lon_lat_h)
-    step_m, _ = robust_points(equations, len(problem.images), _terms(problem, state, 1.0))
-    return moved(equations, state, step_m)[1]
+    found = parts.each(robust_part, parts.at(state.place), same(1.0))
+    step_m = joined(parts.points, found, "step_m")
+    return replace(state, lon_lat_h=move_metres(state.lon_lat_h, step_m))
 
 
 def _falling_scale(problem: BlockProblem) -> float:
@@ -83,21 +137,9 @@ def _falling_scale(problem: BlockProblem) -> float:
     return float(np.sqrt(np.mean(sigmas**2)) / np.median(observed_px)) if len(observed_px) else 1.0
 
 
-def _terms(problem: BlockProblem, state: State, scale: float) -> RobustTerms:
-    """The terms of a scale; known heights hold the points that ortho-images alone show."""
-    known_m, variance_m2 = problem.known_heights
-    held = problem.flat & np.isfinite(known_m)
-    return RobustTerms(
-        scale=scale,
-        coordinates=problem.ray_coordinates,
-        height_weight=np.where(held, scale**2 / np.where(held, variance_m2, 1.0), 0.0),
-        height_step_m=np.where(held, known_m - state.lon_lat_h[:, 2], 0.0),
-    )
-
-
-def _check_points(problem: BlockProblem, step_m: Array) -> None:
+def _check_points(problem: BlockProblem, determined: int) -> None:
     # A ray of a known point needs no second one.
-    intersected = int(np.isfinite(step_m[:, 0]).sum()) + len(problem.single_rays[0])
+    intersected = determined + len(problem.single_rays[0])
     if intersected < problem.options.min_points:
         rays = np.bincount(problem.observations.point, minlength=problem.n_points)
         without = int((problem.flat & (rays >= 2) & np.isnan(problem.known_heights[0])).sum())

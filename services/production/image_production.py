@@ -174,14 +174,14 @@ def produce_points(
     begun = time.thread_time()
     work = work or Work()
     passes = image_passes([scene.acquisition for scene in scenes])
-    images = _Images(scenes, passes, options, control.neighbour)
-    ties, flat, tied = _tied(images, control, work, part_of(progress, 0.0, 0.5))
+    images = _Images(scenes, passes, options, control.neighbour, work)
+    ties, flat, tied = _tied(images, control, part_of(progress, 0.0, 0.5))
     candidates = _candidates(images.placed(tied), tied, ties, options, excluded)
-    measured = _measured(images, tied, candidates, control, work=work, progress=progress)
+    measured = _measured(images, tied, candidates, control, progress)
     progress(0.8, "adjusting the block on its chips")
     measured, adjustment = images.adjusted_with_noise(measured)
     chosen = _chosen(images, measured, adjustment, excluded)
-    points, chips, missing = _cut_out(images, adjustment, chosen, work, part_of(progress, 0.8, 0.2))
+    points, chips, missing = _cut_out(images, adjustment, chosen, part_of(progress, 0.8, 0.2))
     progress(1.0, f"{len(points)} points")
     return Production(
         points,
@@ -221,12 +221,14 @@ class _Images:
         of_passes: masks of images that may share errors.
         options: of the block.
         neighbour: images of an adjusted block; None without one.
+        work: computes the tasks.
     """
 
     scenes: Sequence[Scene]
     of_passes: Sequence[BoolArray]
     options: ProductionOptions
     neighbour: KnownImages | None
+    work: Work
 
     def adjusted(self, observations: Observations, control: ControlGround) -> BlockAdjustment:
         """The block adjustment of the images."""
@@ -247,6 +249,7 @@ class _Images:
             neighbour=self.neighbour,
             passes=self.of_passes,
             options=self.options.block,
+            work=self.work,
         )
 
     def adjusted_with_noise(self, measured: _Measured) -> tuple[_Measured, BlockAdjustment]:
@@ -273,7 +276,7 @@ class _Images:
 
 
 def _tied(
-    images: _Images, control: Control, work: Work, progress: Progress
+    images: _Images, control: Control, progress: Progress
 ) -> tuple[Observations, ControlGround, BlockAdjustment]:
     """Tie points, the known heights of some, and the adjustment of the block on both."""
 
@@ -281,7 +284,7 @@ def _tied(
         flat = joined_ground([ortho_heights(images.scenes, ties, one) for one in control.heights])
         return flat, images.adjusted(ties, flat)
 
-    options, passes = images.options, images.of_passes
+    options, passes, work = images.options, images.of_passes, images.work
     features = options.features.for_chips(max(map(scene_gsd_m, images.scenes)), options.fine_gsd_m)
     ties = find_tie_points(images.scenes, passes, features, work, part_of(progress, 0.0, 0.5))
     if len(ties) == 0:
@@ -300,16 +303,10 @@ def _tied(
 
 
 def _measured(
-    images: _Images,
-    tied: BlockAdjustment,
-    candidates: Array,
-    control: Control,
-    *,
-    work: Work,
-    progress: Progress,
+    images: _Images, tied: BlockAdjustment, candidates: Array, control: Control, progress: Progress
 ) -> _Measured:
     """Candidates (n, 3) and the control, measured in the images as tie points have adjusted them."""
-    scenes, options = images.placed(tied), images.options
+    scenes, options, work = images.placed(tied), images.options, images.work
     measures, saliency = measure_points(
         scenes,
         candidates,
@@ -471,11 +468,12 @@ def _select_points(
 
 
 def _cut_out(
-    images: _Images, adjustment: BlockAdjustment, chosen: _Chosen, work: Work, progress: Progress
+    images: _Images, adjustment: BlockAdjustment, chosen: _Chosen, progress: Progress
 ) -> tuple[ControlPoints, Callable[[int], ChipArray], Mapping[str, int]]:
     """The chosen points as those of one chip file, the chips of each, and why surfaces are missing."""
     rows, n = chosen.rows, len(chosen.rows)
-    scenes, places, options = images.placed(adjustment), adjustment.lon_lat_h[rows], images.options
+    scenes, places = images.placed(adjustment), adjustment.lon_lat_h[rows]
+    options, work = images.options, images.work
     of_models_m2, search = adjustment.point_shared_m2[rows, 2, 2], part_of(progress, 0.0, 0.5)
     surface, missing = surfaces_at(
         scenes, places, options.surface_pairs, of_models_m2=of_models_m2, work=work, progress=search

@@ -8,13 +8,15 @@ import pytest
 from scipy.stats import chi2
 
 from amers.services.adjustment.block_accuracy import block_accuracy
+from amers.services.adjustment.block_parts import Weights, block_parts
 from amers.services.adjustment.block_problem import BlockOptions, BlockProblem
-from amers.services.adjustment.block_solution import checked_gauge, least_squares
+from amers.services.adjustment.block_solution import checked_gauge, least_squares, normals
 from amers.services.adjustment.bundle import adjust_block
 from amers.services.adjustment.control_check import agreeing_control
 from amers.services.adjustment.control_ground import ControlGround
 from amers.services.adjustment.parameters import AdjustableImage, block_priors, image_parameters
 from amers.services.adjustment.robust_start import active_observations, robust_start
+from amers.services.adjustment.settled_block import judged
 from amers.services.geodesy import move_metres
 from amers.services.types import Array, BoolArray, Frame, Observations
 from tests.services.simulated import ring_of_geometries
@@ -63,14 +65,16 @@ class Block:
         problem = BlockProblem(
             self.images, self.observations, self.control, BlockOptions(), n_points, priors.size
         )
-        state = robust_start(problem, priors)[0]
-        weight = problem.weights(np.ones(len(self.observations)), active)
-        equations = problem.equations(state.values, state.lon_lat_h, weight)
-        gauge = checked_gauge(problem, equations, state.lon_lat_h)
-        solved = least_squares(problem, priors, gauge, state, weight)
+        parts = block_parts(problem)
+        state = robust_start(parts, priors)[0]
+        weights = Weights(np.ones(len(self.observations)), active.astype(np.float64))
+        first = normals(parts, state.place, weights)
+        gauge = checked_gauge(parts, first)
+        solved = least_squares(parts, priors, gauge, first)
         of_images = len(self.images) * priors.size
-        accuracy = block_accuracy(solved.system, problem.pairs, gauge, of_images)
-        return agreeing_control(problem, solved.equations, solved.points, accuracy, active)
+        accuracy = block_accuracy(solved.system, parts.pairs, gauge, of_images)
+        told = judged(parts, solved, accuracy)[2]
+        return agreeing_control(self.control.known_coordinates(), told, active)
 
 
 @pytest.fixture(scope="module")

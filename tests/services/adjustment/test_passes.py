@@ -5,7 +5,7 @@ import pytest
 
 from amers.services.adjustment.block_accuracy import positive_part
 from amers.services.adjustment.bundle import adjust_block
-from amers.services.adjustment.parameters import block_priors, image_parameters, sharing_covariance
+from amers.services.adjustment.parameters import block_priors, image_parameters, own_part, shared_part
 from tests.services.conftest import SHAPE, FlatModel
 from tests.services.simulated import ring_of_geometries
 from tests.services.ties import make_ties
@@ -21,7 +21,8 @@ PASS = np.array([True, False, True])
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_shifts_of_a_pass_have_a_share_of_their_variances_in_common(share: float) -> None:
     """An error on the ground moves images of one view by as much, in units of their sigmas."""
-    covariance = sharing_covariance(IMAGES, PASS, share)
+    every = np.eye(4)
+    covariance = own_part(IMAGES, PASS, every) + share * shared_part(IMAGES, PASS, every)
     between = share * SIGMAS_PX[0] * SIGMAS_PX[2] * np.eye(2)
     own = [sigma_px**2 * np.eye(2) for sigma_px in (SIGMAS_PX[0], SIGMAS_PX[2])]
     np.testing.assert_allclose(covariance, np.block([[own[0], between], [between, own[1]]]), atol=1e-9)

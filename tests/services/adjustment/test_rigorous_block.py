@@ -9,7 +9,7 @@ from amers.services.adjustment.block_problem import BlockOptions
 from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
 from amers.services.adjustment.control_ground import NO_CONTROL, ControlGround
 from amers.services.adjustment.parameter_figures import held_parameters, parameter_figures
-from amers.services.adjustment.parameters import AdjustableImage, image_parameters, sharing_covariance
+from amers.services.adjustment.parameters import AdjustableImage, image_parameters, own_part, shared_part
 from amers.services.adjustment.rigorous_parameters import rigorous_parameters
 from amers.services.errors import InputError
 from amers.services.geodesy import lon_lat_h_from_east_north_up
@@ -214,7 +214,9 @@ def test_the_sets_have_the_parameters_that_were_published() -> None:
 
 def test_images_of_a_pass_share_errors_whatever_their_model_is() -> None:
     images = mixed()
-    full = sharing_covariance(images, np.ones(3, dtype=np.bool_), 1.0)
+    everyone = np.ones(3, dtype=np.bool_)
+    every = np.eye(int(sum(image.locating.sum() for image in images)))
+    full = own_part(images, everyone, every) + shared_part(images, everyone, every)
     assert np.linalg.eigvalsh(full).min() > -1e-9
     # An error that all share moves the ground under all images alike.
     values = [image.shared_direction() @ [1.0, 0.0] for image in images]
