@@ -19,13 +19,17 @@ from distributed import Client
 from rasterio.transform import from_origin
 
 from amers.app.errors import InputError
-from amers.app.usecases.executors import ComputeOptions
+from amers.app.usecases.executors import ComputeOptions, open_executor
 from amers.app.usecases.ground_classes import GroundFiles
 from amers.app.usecases.image_production import ProductionImages, WorkPlace, run_image_production
 from amers.app.usecases.new_block import BlockIdentity
+from amers.services.adjustment import block_parts, dissection, reduced_system
+from amers.services.adjustment.bundle import adjust_block
 from amers.services.formats.block.reader import read_block
 from amers.services.formats.images.raster import write_raster
 from amers.services.production.image_production import Production
+from amers.services.tasks import Arrays, Work
+from benchmarks.block_adjustment import large_block
 from tests.service_process import free_port
 from tests.services.simulated import BLOCK_SIGMA_M, OPTIONS, block_views, world
 
@@ -177,6 +181,31 @@ def test_a_worker_that_is_killed_beside_a_slow_one_changes_nothing(images, alone
         )
         assert killed
     assert content(tmp_path / "block") == alone
+
+
+def test_a_block_is_adjusted_in_parts_bit_for_bit_though_a_worker_is_killed(monkeypatch) -> None:
+    monkeypatch.setattr(block_parts, "PART_OBSERVATIONS", 1000)
+    monkeypatch.setattr(dissection, "GROUP_ROWS", 100)
+    monkeypatch.setattr(dissection, "DIRECT_ROWS", 100)
+    monkeypatch.setattr(reduced_system, "DENSE_ROWS", 100)
+    _, images, observations, passes = large_block(60, 60, seed=3, blunders=0.05)
+    here = Work()
+    alone = adjust_block(images, observations, passes=passes, work=here)
+    with dask_cluster(2) as cluster, open_executor(ComputeOptions(cluster=cluster.address)) as opened:
+
+        class Killing(dict[str, Arrays]):
+            """Kills a worker when the first step is kept."""
+
+            def __setitem__(self, name: str, arrays: Arrays) -> None:
+                cluster.workers[0].kill()
+                super().__setitem__(name, arrays)
+
+        work = Work(opened[0], Killing(), opened[1])
+        block = adjust_block(images, observations, passes=passes, work=work)
+    assert cluster.workers[0].poll() is not None
+    assert work.effort["adjust"].tasks == here.effort["adjust"].tasks > 50
+    for name in ("values", "lon_lat_h", "point_covariance_m2", "residual_px", "active"):
+        np.testing.assert_array_equal(getattr(block, name), getattr(alone, name))
 
 
 class StoppedHereError(Exception):
