@@ -180,16 +180,15 @@ class BlockProblem:
         lon_lat_h = np.full((self.n_points, 3), np.nan)
         known_m = self.known_heights[0]
         first = np.unique(self.observations.point, return_index=True)[1]
+        first = first[np.argsort(self.observations.image[first], kind="stable")]
+        ends = np.searchsorted(self.observations.image[first], np.arange(len(self.images) + 1))
         low, high = self._common_heights
         for i, image in enumerate(self.images):
-            rows = first[self.observations.image[first] == i]
-            known_of = known_m[self.observations.point[rows]]
+            rows = first[ends[i] : ends[i + 1]]
             point = self.observations.point[rows]
             middle_m = np.clip(np.mean(image.model.height_range_m), low[point], high[point])
-            height_m = np.where(np.isfinite(known_of), known_of, middle_m)
-            lon_lat_h[self.observations.point[rows]] = image.model.locate(
-                self.observations.line_sample[rows], height_m
-            )
+            height_m = np.where(np.isfinite(known_m[point]), known_m[point], middle_m)
+            lon_lat_h[point] = image.model.locate(self.observations.line_sample[rows], height_m)
         known = np.isfinite(np.diagonal(self.control.covariance_m2, 0, 1, 2)) & np.isfinite(
             self.control.lon_lat_h
         )

@@ -313,35 +313,49 @@ def block_priors(
     size = max([len(image.sigma) for image in images] + [3] * bool(frames))
     n = len(images) + len(frames)
     # Parameters that an image lacks keep a unit weight, so that the matrix has an inverse.
-    apart, shape = sparse.lil_matrix((n * size, n * size)), np.zeros(n * size)
-    estimated = np.zeros(n * size, dtype=np.bool_)
+    apart, shape = np.zeros((n, size, size)), np.zeros((n, size))
+    estimated = np.zeros((n, size), dtype=np.bool_)
     for i, image in enumerate(images):
         k = len(image.sigma)
         weight = np.ones(size)
         weight[:k] = image.sigma**-2.0
         tells = np.ones(size, dtype=np.bool_)
         tells[:k] = image.locating
-        rows = i * size + np.arange(size)
-        apart[rows, rows] = np.where(tells, weight, 0.0)
-        shape[rows] = np.where(tells, 0.0, weight)
-        estimated[rows[:k]] = image.estimated
-    shared = [sparse.csc_matrix((n * size, 0))]
+        apart[i] = np.diag(np.where(tells, weight, 0.0))
+        shape[i] = np.where(tells, 0.0, weight)
+        estimated[i, :k] = image.estimated
+    shared = [np.empty((0, 3))]
+    width = 0
     for members in passes:
-        own, columns = _shared_columns([images[i] for i in np.flatnonzero(members).tolist()])
-        for i, alone in zip(np.flatnonzero(members).tolist(), own, strict=True):
-            rows = i * size + np.flatnonzero(images[i].locating)
-            apart[np.ix_(rows, rows)] = alone
+        chosen = np.flatnonzero(members).tolist()
+        own, columns = _shared_columns([images[i] for i in chosen])
+        for i, alone in zip(chosen, own, strict=True):
+            apart[i][np.ix_(images[i].locating, images[i].locating)] = alone
+        rows, count = shift_rows(images, members, size), columns.shape[1]
+        place = np.repeat(rows, count), width + np.tile(np.arange(count), len(rows))
+        shared.append(np.column_stack([*place, columns.ravel()]))
         # Blocks of columns, as others are of parameters.
-        of_pass = sparse.lil_matrix((n * size, size * -(-columns.shape[1] // size)))
-        of_pass[shift_rows(images, members, size), : columns.shape[1]] = columns
-        shared.append(of_pass.tocsc())
+        width += size * -(-count // size)
     for i, covariance in enumerate(frames):
-        rows = (len(images) + i) * size + np.arange(3)
-        apart[np.ix_(rows, rows)] = frame_weight(covariance)
-        rest = np.arange(rows[-1] + 1, (len(images) + i + 1) * size)
-        apart[rest, rest] = 1.0
-    columns = sparse.hstack(shared).tocsc()
-    return BlockPriors(size, apart.tocsc(), columns, shape, estimated, np.zeros(n * size))
+        apart[len(images) + i] = np.eye(size)
+        apart[len(images) + i, :3, :3] = frame_weight(covariance)
+    row, column, value = np.concatenate(shared).T
+    return BlockPriors(
+        size,
+        _block_diagonal(apart),
+        sparse.coo_matrix((value, (row.astype(int), column.astype(int))), (n * size, width)).tocsc(),
+        shape.ravel(),
+        estimated.ravel(),
+        np.zeros(n * size),
+    )
+
+
+def _block_diagonal(blocks: Array) -> sparse.csc_matrix:
+    """The sparse matrix of blocks (n, k, k) on its diagonal."""
+    n, k, _ = blocks.shape
+    matrix = sparse.bsr_matrix((blocks, np.arange(n), np.arange(n + 1)), shape=(n * k, n * k)).tocsc()
+    matrix.eliminate_zeros()
+    return matrix
 
 
 def _shared_columns(images: Sequence[AdjustableImage]) -> tuple[list[Array], Array]:
