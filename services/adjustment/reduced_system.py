@@ -104,15 +104,18 @@ class ReducedSystem:
         The errors that passes share are unknowns of their own, so that no pass ties all of its images.
         """
         dissection, shared = self.dissection(), self.priors.shared
-        count, beside = columns.shape[0], shared.shape[1]
-        whole = (self.observed + self.priors.apart + sparse.diags(self.priors.shape)).tocsc()
-        if beside:
-            errors = sparse.identity(beside)
-            whole = sparse.bmat([[whole, shared], [shared.T, errors]]).tocsc()
+        (count, beside), observed = shared.shape, self.observed
+        whole = (count + beside, count + beside)
+        own = self.priors.apart + sparse.diags(self.priors.shape)
+        priors = sparse.bmat([[own, shared], [shared.T, sparse.identity(beside)]]) if beside else own
+        # Larger, without a copy.
+        ends = np.append(observed.indptr, np.full(beside, observed.indptr[-1], observed.indptr.dtype))
+        told = sparse.csc_matrix((observed.data, observed.indices, ends), shape=whole)
+        matrix = told + priors.tocsc()
         nowhere = np.full((beside // dissection.size, 2), np.nan)
         augmented = replace(dissection, place=np.vstack([dissection.place, nowhere]))
         right = np.vstack([columns, np.zeros((beside, columns.shape[1]))])
-        solution, blocks = augmented.solution(whole, right, pairs)
+        solution, blocks = augmented.solution(matrix, right, pairs)
         return solution[:count], blocks
 
     def dense_inverse(self, root: Array) -> Array:
@@ -151,8 +154,8 @@ def reduced_system(
     columns = np.concatenate([pairs.other, first[apart]])
     order = np.lexsort((columns, rows))
     # Entries of zero have entries of the inverse; SuperLU would leave them out.
-    values = np.where(values == 0.0, _TRACE, values)
     blocks = np.concatenate([values, values[apart].transpose(0, 2, 1)])[order]
+    blocks[blocks == 0.0] = _TRACE
     start = np.searchsorted(rows[order], np.arange(n + 1))
     observed = sparse.bsr_matrix((blocks, columns[order], start), shape=(n * k, n * k))
     return ReducedSystem(observed.tocsc(), priors, gauge, dissection)
