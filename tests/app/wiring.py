@@ -88,9 +88,8 @@ _FILES = ("dem", "control_dem", "model")
 _USER = Origin().actor_name
 """As the audit names who calls commands."""
 _OF_THIS_RUN = re.compile(
-    r" at 0x[0-9a-f]+| id='\d+'|/\d{12,}|[\d-]+ [\d:]+\.\d{6}\+00:00|(?<=seconds)\W+[\d.]+,?|(?<=time \(s\)) +[\d.]+|"
-    + re.escape(gettempdir())
-    + r"/[\w.-]+"
+    r" at 0x[0-9a-f]+| id='\d+'|/\d{12,}|[\d-]+ [\d:]+\.\d{6}\+00:00|(?<=seconds)\W+[\d.]+,?|"
+    r"(?<=time \(s\)) +[\d.]+|" + re.escape(gettempdir()) + r"/[\w.-]+"
 )
 """Addresses of objects, times of now, durations, and temporary folders."""
 
