@@ -30,6 +30,8 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "wiring.json"
 PACKAGE = "amers.app.cli."
 SHOWN = "what is shown"
 """Beside the options of a command: its result, as it goes to the terminal."""
+ASIDE = "(on standard error) "
+"""How lines begin that are not the result."""
 SERVICES = ("demo", "serve", "worker")
 """Commands that run services, which no recorder ends."""
 AN_ID = "01234567-89ab-4cde-8f01-23456789abcd"
@@ -83,7 +85,7 @@ COMPANIONS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("--token", ("--server", "http://127.0.0.1:9")),
 )
 """What an option needs beside it, by how its name begins; the first that fits."""
-_FILES = ("dem", "control_dem", "model")
+_FILES = ("dem", "control_dem", "model", "reference", "control_ortho")
 """Options whose files the command itself looks for."""
 _USER = Origin().actor_name
 """As the audit names who calls commands."""
@@ -184,7 +186,9 @@ def run(words: list[str], folder: Path) -> list[tuple[str, str]]:
         recorders = Recorders(monkeypatch, PACKAGE)
         with contextlib.suppress(Exception):
             result = CliRunner().invoke(app, words)
-            recorders.notes += [(SHOWN, line.rstrip()) for line in result.output.splitlines()]
+            recorders.notes += [(SHOWN, line.rstrip()) for line in result.stdout.splitlines()]
+            aside = result.stderr.splitlines() if "Usage: " not in result.stderr else []
+            recorders.notes += [(SHOWN, f"{ASIDE}{line.rstrip()}") for line in aside]
             recorders.notes.append(("exit status", str(result.exit_code)))
     plain = [
         (path, _OF_THIS_RUN.sub("", text.replace(str(folder), "FOLDER").replace(_USER, "USER")))
@@ -218,7 +222,7 @@ def wiring(words: tuple[str, ...], folder: Path) -> dict[str, list[str]]:
         if one.opts[0] == "--json":
             found[one.opts[0]] = [text for path, text in notes if path == SHOWN]
             continue
-        moved = {(path, text) for path, text in notes if path != SHOWN} - set(bases[with_it])
+        moved = set(notes) - set(bases[with_it])
         found[one.opts[0]] = sorted({f"{path} = {text}" for path, text in moved})
     return found
 
