@@ -200,13 +200,17 @@ class _Level:
         """The system that is left for the separators."""
         rows = self._rows(self.separators)
         right, whole = self.columns[rows], self.matrix[rows][:, rows].tocoo()
-        entries = [(whole.data, whole.row.astype(np.int64), whole.col.astype(np.int64))]
+        count = whole.nnz + sum(one["schur"].size for one in found)
+        data = np.empty(count)
+        row, column = np.empty(count, dtype=np.int32), np.empty(count, dtype=np.int32)
+        data[: whole.nnz], row[: whole.nnz], column[: whole.nnz] = whole.data, whole.row, whole.col
+        at = whole.nnz
         for group, one in zip(self.groups, found, strict=True):
             own = np.searchsorted(rows, self._rows(group.boundary))
             right[own] -= one["right"]
-            places = (np.repeat(own, len(own)), np.tile(own, len(own)))
-            entries.append((-one.pop("schur").ravel(), *places))
-        data, row, column = (np.concatenate(part) for part in zip(*entries, strict=True))
+            here = np.s_[at : at + len(own) ** 2]
+            data[here], at = -one.pop("schur").ravel(), here.stop
+            row[here], column[here] = np.repeat(own, len(own)), np.tile(own, len(own))
         return sparse.coo_matrix((data, (row, column)), whole.shape).tocsc(), right
 
     def _inverse(self, pairs: Pairs, needed: Pairs, told: Array) -> Array:
