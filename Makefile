@@ -14,7 +14,7 @@ WORKERS := $(shell expr $$(env -u OMP_NUM_THREADS nproc) \* 3 / 2)
 # The plugin of schemathesis takes two seconds to load, and only the tests of all operations need it.
 PYTEST := $(BIN)/python -m pytest -p no:schemathesis --dist loadfile --no-loadscope-reorder --durations 20
 APART := not endurance and not qgis
-LONG := cape_verde continent distorted real_scenes faults image_selection load stress throughput block_adjustment toutin
+LONG := cape_verde continent distorted real_scenes faults image_selection load stress throughput block_adjustment block_parts toutin
 
 .PHONY: demo test test-thorough test-files test-operations test-shuffled test-fast test-security test-endurance test-qgis check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput mutants postgis page chromium proxies pictures plugin release
 
