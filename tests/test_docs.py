@@ -111,11 +111,11 @@ def searched(site: Path) -> Iterator[Page]:
         page = browser.new_page()
         asked: list[str] = []
         page.on("request", lambda request: asked.append(request.url))
-        # The worker of the search sends a message once it has read the index.
-        page.add_init_script("addEventListener('message', () => (window.isIndexed = true))")
         page.goto((site / "index.html").as_uri())
         page.get_by_role("textbox", name="Search").click()
-        page.wait_for_function("window.isIndexed", timeout=patience_ms)
+        # It says so once it has read the index.
+        ready = page.locator(".md-search-result__meta")
+        expect(ready).to_have_text("Type to start searching", timeout=patience_ms)
         yield page
         browser.close()
     assert [url for url in asked if not url.startswith(("file:", "data:"))] == []
