@@ -27,6 +27,7 @@ import numpy as np
 
 from amers.services.adjustment import block_parts, dissection
 from amers.services.adjustment.bundle import BlockAdjustment, adjust_block
+from amers.services.formats.work_folder import WorkFolder
 from amers.services.tasks import Arrays, Work
 from amers.services.types import Array
 from benchmarks._measuring import keep, memory_mib, print_table
@@ -101,12 +102,12 @@ def adjusted(n_images: int, per_image: int, whole: bool, result: Path | None) ->
     if whole:
         block_parts.PART_OBSERVATIONS = dissection.DIRECT_ROWS = NEVER
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context) as executor:
+    with TemporaryDirectory() as folder, ProcessPoolExecutor(1, mp_context=context) as executor:
         _, *warm = large_block(400, 20, seed=0)
         adjust_block(warm[0], warm[1], passes=warm[2])
         executor.submit(_warmed).result()
         _, images, observations, passes = large_block(n_images, per_image, seed=1, blunders=BLUNDERS)
-        work = Work(executor, ahead=1)
+        work = Work(executor, WorkFolder(Path(folder), {}), ahead=1)
         forget_peak()
         before = memory_mib("VmRSS"), executor.submit(memory_mib, "VmRSS").result()
         begun = time.process_time()
