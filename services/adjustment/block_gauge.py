@@ -63,9 +63,9 @@ def block_gauge(
 
     Tie points do not determine the position of a block. Its images see it under slightly different
     angles from edge to edge, though, and a distortion of 0.1 px would look like a translation by metres.
-    So the observations are not used to estimate a translation. Nor are they used for a ground that is
-    sheared, stretched or tilted as a whole, where the images may drift and skew: a change of all images
-    together has the same effect, and only relief, seen under different angles, shows the difference.
+    So the observations are not used to estimate a translation. Where the images may drift and skew, the
+    observations are not used for a shear, a stretch or a tilt of the whole ground either: a change of
+    all images together has the same effect, and only relief, seen under different angles, differs.
 
     Args:
         group: (n,) of every block of parameters.

@@ -119,7 +119,7 @@ class Dissection:
 
 
 class _Group(NamedTuple):
-    """Blocks of a group, and those that separate it from others, ascending."""
+    """Blocks inside a group, and the separator blocks beside it; both ascending."""
 
     inside: IntArray
     boundary: IntArray

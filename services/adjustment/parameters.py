@@ -265,7 +265,7 @@ class BlockPriors:
     """The a priori accuracy of all parameters of a block, in blocks of `size`; absent ones are fixed.
 
     Attributes:
-        size: parameters of the image that has most; those that others lack have no derivative.
+        size: largest number of parameters of an image; one that an image lacks has no derivative.
         apart: (K, K) sparse, `locating` plus the squares of the columns `shared`: no pass ties images.
         shared: (K, q) sparse, the errors that the images of a pass share, in blocks of `size` columns
             for every pass.

@@ -36,9 +36,9 @@ def robust_part(part: Part, at: Place, scale: float) -> Arrays:
     """Points where most of their rays intersect, for Cauchy weights of a scale.
 
     Returns:
-        `step_m` (p, 3) of the points; whether they are `determined` (p,); of the image positions their
-        robust `weight` (m,), `square` (m,) of the residuals, and `single` (m,), the sizes of those of
-        the only rays of known points, which other rows do not have.
+        `step_m` (p, 3) of the points, and whether each is `determined` (p,). For image positions: robust
+        `weight` (m,), `square` (m,) of the residuals, and `single` (m,), the
+        size of the residual where the position is the only ray of a known point, 0 elsewhere.
     """
     problem = part.problem
     equations = problem.equations(at.values, at.lon_lat_h)
@@ -66,7 +66,7 @@ def control_part(part: Part, at: Place, weights: Weights) -> Arrays:
 
 
 def normal_part(part: Part, at: Place, weights: Weights, extent: Array) -> Arrays:
-    """The normal equations of the parameters, points eliminated, and what tells of the gauge.
+    """The normal equations of the parameters, points eliminated, and sums for the gauge.
 
     Args:
         part: of a block.
@@ -75,10 +75,10 @@ def normal_part(part: Part, at: Place, weights: Weights, extent: Array) -> Array
         extent: (2, 2) middle and size of the block, degrees.
 
     Returns:
-        `normal` (s, k, k) of the pairs, and how many observations they have in `common` (s,); of every
-        block the right side `right` (n, k), and the sums for the gauge, `own` (n, k, k) and `followed`
-        (n, k, 9); `determined` (p,) points; rows of `observations` (m,) and `control` (c,) that could be
-        computed.
+        For pairs: `normal` (s, k, k), and `common` (s,), the number of their common observations. For
+        blocks of parameters: the right side `right` (n, k), and the sums for the gauge, `own` (n, k, k)
+        and `followed` (n, k, 9). Flags: `determined` (p,) of points, and `observations` (m,) and
+        `control` (c,) of rows that could be computed.
     """
     problem = part.problem
     equations, points = _solved(part, at, weights)
@@ -115,7 +115,7 @@ def moved_part(part: Part, at: Place, weights: Weights, change: Array) -> Arrays
 def judged_part(
     part: Part, at: Place, weights: Weights, after: Place, covariance: Array | None
 ) -> Arrays:
-    """What least squares at one place tell of the observations after their last step.
+    """Residuals of the observations, and of control points, after the last step of least squares.
 
     Args:
         part: of a block.
