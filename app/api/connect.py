@@ -1,6 +1,6 @@
-"""How standard clients connect: a page with lines to copy, which carry the address of this service.
+"""How standard clients connect: a page of copy-and-paste examples with the address of this service.
 
-The same recipes make `docs/connect.md` (`scripts/make_connect_page.py`), and the tests run them.
+`scripts/make_connect_page.py` writes `docs/connect.md` from the same recipes, and the tests run them.
 """
 
 from dataclasses import dataclass, field
@@ -22,10 +22,10 @@ router = APIRouter(include_in_schema=False, route_class=CallerRoute)
 
 TITLE = "Connect"
 INTRODUCTION = (
-    "Lines to copy for clients that people have. The tests of Amers run them against a service, and "
-    "fill in the forms of QGIS. Points need a token of scope `read`, scenes one of scope "
-    "`register`; an administrator makes one with `amers token create`. Where points are public, leave "
-    "the token out."
+    "Copy-and-paste examples for common clients of an Amers service. Requests for points need a token "
+    "of scope `read`, requests for scenes a token of scope `register`. An administrator creates tokens "
+    "with `amers token create`. If the points of the service are public, leave the token out. The tests "
+    "of Amers run these examples against a service and fill in the forms of QGIS."
 )
 EXAMPLE = "https://gcp.example.org"
 """The address of the service in the documentation."""
@@ -40,8 +40,8 @@ class Lines:
     """Lines to copy.
 
     Attributes:
-        language: that they are written in; `text`: values for a form.
-        text: the lines; `BASE` is the address of the service without a slash at its end.
+        language: of the lines; `text` means values for a form.
+        text: the lines; `BASE` stands for the address of the service without a slash at its end.
     """
 
     language: Literal["bash", "python", "text"]
@@ -60,10 +60,10 @@ class Recipe:
     """How one client connects.
 
     Attributes:
-        client: its name, with the versions.
-        about: what its user has to know; code stands between backticks.
-        steps: to copy, in their order.
-        after: what can be done then.
+        client: name and versions of the client.
+        about: what the reader does before copying; code is between backticks.
+        steps: lines to copy, in their order.
+        after: what the reader can do afterwards.
     """
 
     client: str
@@ -75,9 +75,10 @@ class Recipe:
 RECIPES = (
     Recipe(
         "The token, once",
-        "The other lines read the token from the variable `TOKEN` or from the file `amers-header`, "
-        "which only you can read. So the token is on no command line, which other users of a machine "
-        "can see. The first line waits for you to paste the token.",
+        "Run these two commands first. The first command waits until you paste the token, and stores it "
+        "in the variable `TOKEN`. The second command writes the token into the file `amers-header`, "
+        "which only you can read. The other examples use the variable or the file. So the token never "
+        "appears on a command line, where other users of the machine could see it.",
         (
             Lines("bash", "read -rs TOKEN && export TOKEN"),
             Lines("bash", '(umask 077 && echo "Authorization: Bearer $TOKEN" > amers-header)'),
@@ -85,8 +86,10 @@ RECIPES = (
     ),
     Recipe(
         "curl",
-        "Points of a box as GeoJSON and, with a filter in CQL2, as GeoParquet. Other formats: `csv`, "
-        "`fgb`, `gpkg`.",
+        "The first command requests the points of a bounding box as GeoJSON. The second command "
+        "requests points that match a CQL2 filter and writes them as GeoParquet. A reply contains at "
+        "most 100 points unless `limit` states another number, up to 10,000. For CSV, FlatGeobuf or "
+        "GeoPackage, write `f=csv`, `f=fgb` or `f=gpkg`.",
         (
             Lines(
                 "bash",
@@ -100,8 +103,9 @@ curl -f -H @amers-header -G BASE/collections/points/items -d f=parquet \\
     ),
     Recipe(
         "GDAL 3.6 and 3.12",
-        "`ogrinfo` and `ogr2ogr`; the service evaluates the box and the condition. "
-        "`GDAL_HTTP_HEADER_FILE` works with both versions.",
+        "`ogrinfo` describes the layer of points, and `ogr2ogr` writes selected points into a "
+        "GeoPackage. The service evaluates the box and the condition, so only the selected points are "
+        "transferred. `GDAL_HTTP_HEADER_FILE` works with both versions of GDAL.",
         (
             Lines(
                 "bash",
@@ -115,31 +119,33 @@ ogr2ogr -spat 5.22 43.21 5.27 43.26 -where "saliency > 0.3" points.gpkg OAPIF:BA
     ),
     Recipe(
         "QGIS 3.22 and later",
-        "Menu *Layer*, *Add Layer*, *Add WFS / OGC API - Features Layer*, *New*. Create an "
-        "authentication configuration of the method *Basic authentication*: any user name, the token "
-        "as password. From QGIS 3.24 on, the method *API Header* with the name `Authorization` and "
-        "the value `Bearer TOKEN` does the same.",
+        "Choose *Layer*, *Add Layer*, *Add WFS / OGC API - Features Layer*, *New*, and enter the values "
+        "below. Create an authentication configuration with the method *Basic authentication*: enter "
+        "any user name, and the token as password. From QGIS 3.24 on, you can instead use the method "
+        "*API Header* with the name `Authorization` and the value `Bearer TOKEN`.",
         (Lines("text", "URL      BASE\nVersion  OGC API - Features"),),
-        "*Connect* lists the layers `points`, `blocks` and `density`. *Only request features "
-        "overlapping the view extent* keeps requests small. Many points are faster as vector tiles: "
-        "*Add Vector Tile Layer*, *New Generic Connection*, with the same authentication and "
-        "`BASE/collections/points/tiles/WebMercatorQuad/{z}/{y}/{x}`.",
+        "*Connect* lists the layers `points`, `blocks` and `density`. The option *Only request features "
+        "overlapping the view extent* keeps requests small. Vector tiles display many points faster. To "
+        "use them, choose *Add Vector Tile Layer*, *New Generic Connection*, with the same "
+        "authentication and the address `BASE/collections/points/tiles/WebMercatorQuad/{z}/{y}/{x}`.",
     ),
     Recipe(
         "QGIS plugin of Amers",
-        "Points with their colours, and registration of the active raster. `make plugin` writes "
-        "`build/amers-qgis.zip`, which *Plugins*, *Manage and Install Plugins*, *Install from ZIP* "
-        "installs. *Raster*, *Amers*, *Service* asks for the address and for the authentication "
-        "configuration of above; registrations need scope `register`.",
+        "The plugin displays the points coloured by their horizontal sigma, and registers the active "
+        "raster layer. `make plugin` writes `build/amers-qgis.zip`. Install this file with *Plugins*, "
+        "*Manage and Install Plugins*, *Install from ZIP*. Then choose *Raster*, *Amers*, *Service*, "
+        "and enter the address below and the authentication configuration of the section on QGIS. A "
+        "registration needs a token of scope `register`.",
         (Lines("text", "Address  BASE"),),
-        "*Add points* adds the points as a layer. *Register the active raster* sends the file of the "
-        "layer with the files of its model, works in the background, and loads the image in its place, "
-        "the control points by their status and their residuals. The results are kept in a folder "
-        "beside the image.",
+        "*Add points* adds the points as a layer. *Register the active raster* uploads the image of the "
+        "layer with the files of its sensor model, and waits for the result in the background. It then "
+        "adds the registered image, the control points by their status, and their residuals as layers. "
+        "The results are stored in a folder next to the image.",
     ),
     Recipe(
         "geopandas 1",
-        "Reads through the GDAL of pyogrio, box and condition included.",
+        "geopandas reads the points with the GDAL library of pyogrio. The service evaluates the box and "
+        "the condition.",
         (
             Lines(
                 "python",
@@ -161,9 +167,10 @@ print(points[["saliency", "n_views", "geometry"]])
     ),
     Recipe(
         "Python client of Amers",
-        "Points and blocks, uploads, registrations and their results; it asks for page after page by "
-        "itself. It comes with Amers. Where Amers is not installed, the package amers-client has it "
-        "alone, with httpx: write `from amers_client import Client`.",
+        "The client reads points and blocks, uploads scenes, starts registrations and downloads their "
+        "results. It requests all pages of a reply by itself. The client is part of Amers. Without "
+        "Amers, install the package amers-client, which needs only httpx, and write `from amers_client "
+        "import Client`.",
         (
             Lines(
                 "python",
@@ -182,7 +189,8 @@ print(len(points), "points;", *[block["properties"]["title"] for block in blocks
     ),
     Recipe(
         "OWSLib",
-        "Collections and features; `owslib.ogcapi.processes` starts registrations the same way.",
+        "OWSLib lists collections and reads features. Its module `owslib.ogcapi.processes` starts "
+        "registrations; the address and the header are the same.",
         (
             Lines(
                 "python",
@@ -200,8 +208,8 @@ print(page["numberMatched"], [feature["id"] for feature in page["features"]])
     ),
     Recipe(
         "pystac-client",
-        "Your scenes with their verdicts, as items of a STAC catalogue. The token needs scope "
-        "`register`.",
+        "pystac-client reads your scenes, with their verdicts, as items of a STAC catalogue. The token "
+        "needs scope `register`.",
         (
             Lines(
                 "python",
@@ -224,7 +232,7 @@ for item in catalog.search(collections=["scenes"], bbox=[5.22, 43.21, 5.27, 43.2
 def connect(
     request: Request, database: DatabaseDep, settings: SettingsDep, caller: CallerDep
 ) -> Response:
-    """Return the page, with the address at which the request has arrived, and a box with points."""
+    """Return the page with the address at which the request arrived, and a box that contains points."""
     refuse_unknown(request, set())
     page = Page(TITLE, INTRODUCTION)
     base = str(request.base_url).rstrip("/")
@@ -258,7 +266,9 @@ def as_markdown(base: str) -> str:
         return fill(text.replace("BASE", base), 128, break_long_words=False, break_on_hyphens=False)
 
     parts = [f"# {TITLE}", paragraph(INTRODUCTION)]
-    parts.append("The service shows this page with its own address at `/connect`.")
+    parts.append(
+        "A running service shows this page at `/connect`, with its own address in the examples."
+    )
     for recipe in RECIPES:
         parts += [f"## {recipe.client}", paragraph(recipe.about)]
         parts += [f"```{lines.language}\n{lines.at(base)}\n```" for lines in recipe.steps]
