@@ -46,18 +46,34 @@ READER = Reader(
     "Masks and land cover of the ground",
     ("read_ground_mask", "read_land_cover"),
     (
-        Treatment(Subject.HORIZONTAL_DATUM, "used", "of an image on a map"),
-        Treatment(Subject.HORIZONTAL_DATUM, "assumed", "WGS 84 of polygons in GeoJSON"),
+        Treatment(Subject.HORIZONTAL_DATUM, "used", "The reference system of an image on a map."),
+        Treatment(Subject.HORIZONTAL_DATUM, "assumed", "Polygons in GeoJSON are in WGS 84."),
         Treatment(
-            Subject.HORIZONTAL_DATUM, "refused", "none of an image; another than WGS 84 in GeoJSON"
+            Subject.HORIZONTAL_DATUM,
+            "refused",
+            "An image has no reference system, or a GeoJSON file states another system than WGS 84.",
         ),
-        Treatment(Subject.ORDER, "refused", "latitudes beyond 90 degrees"),
-        Treatment(Subject.VALIDITY, "used", "nodata: such ground is not excluded, its cover is unknown"),
+        Treatment(Subject.ORDER, "refused", "A latitude is above 90 degrees."),
         Treatment(
-            Subject.BANDS, "refused", "several bands of land cover: which has the classes is open"
+            Subject.VALIDITY,
+            "used",
+            "Nodata pixels: their ground is not excluded, and their land cover is unknown.",
         ),
-        Treatment(Subject.IDENTITY, "assumed", "classes of ESA WorldCover, where there are no others"),
-        Treatment(Subject.IDENTITY, "named", "properties of the polygons: all of them are excluded"),
+        Treatment(
+            Subject.BANDS,
+            "refused",
+            "The land cover has several bands, so it is not clear which band contains the classes.",
+        ),
+        Treatment(
+            Subject.IDENTITY,
+            "assumed",
+            "Classes are those of ESA WorldCover, unless the file states others.",
+        ),
+        Treatment(
+            Subject.IDENTITY,
+            "named",
+            "The properties of the polygons, because all polygons are excluded.",
+        ),
     ),
     (
         Subject.MODEL,

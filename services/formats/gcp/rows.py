@@ -7,30 +7,37 @@ _NEVER = (Subject.MODEL, Subject.PLACE, Subject.BANDS)
 _NO_DATUM = Treatment(
     Subject.VERTICAL_DATUM,
     "refused",
-    "heights without a datum, unless `--vertical` or `--geoid` states it",
+    "The heights have no stated datum. State it with `--vertical` or `--geoid`.",
 )
 _IN_COMMENT = Treatment(
     Subject.VERTICAL_DATUM,
     "used",
-    "in a comment, such as `# heights: EGM96`; refused where the caller differs",
+    "A comment states the datum of the heights, such as `# heights: EGM96`. If you state another datum, "
+    "the file is refused.",
 )
 _OTHER_BODY = Treatment(
     Subject.HORIZONTAL_DATUM,
     "refused",
-    "of the Moon or another body, not understood, or two that differ",
+    "The stated system is not of the Earth, cannot be understood, or differs from a second stated "
+    "system.",
 )
 _FEET_IN_COMMENT = Treatment(
-    Subject.UNIT, "refused", "a comment that states heights in feet or another unit than metres"
+    Subject.UNIT, "refused", "A comment states that heights are in feet or in another unit than metres."
 )
-_EPOCH = Treatment(Subject.EPOCH, "named", "in a comment; datums are taken at their own epoch")
-_ACCURACY = Treatment(Subject.ACCURACY, "named", "in a comment")
+_EPOCH = Treatment(
+    Subject.EPOCH, "named", "An epoch in a comment. Each datum is used at its own reference epoch."
+)
+_ACCURACY = Treatment(Subject.ACCURACY, "named", "An accuracy in a comment.")
 _FILE_NAMES = Treatment(
-    Subject.IDENTITY, "used", "images by their file names, without the folders of another computer"
+    Subject.IDENTITY,
+    "used",
+    "Images are identified by their file names. Folder names are ignored, because they may be of "
+    "another computer.",
 )
 _EXCHANGED = Treatment(
     Subject.ORDER,
     "refused",
-    "points that lie in the area of their reference system only with x and y exchanged",
+    "The points are in the area of their reference system only if x and y are exchanged.",
 )
 
 ASP_READER = Reader(
@@ -38,27 +45,35 @@ ASP_READER = Reader(
     ("parse_asp_gcp",),
     (
         Treatment(
-            Subject.HORIZONTAL_DATUM, "used", "in a comment: `# WKT: GEOGCS[...]`, `--datum NAD27`"
+            Subject.HORIZONTAL_DATUM,
+            "used",
+            "A comment states the datum, such as `# WKT: GEOGCS[...]` or `--datum NAD27`.",
         ),
-        Treatment(Subject.HORIZONTAL_DATUM, "assumed", "WGS 84"),
+        Treatment(Subject.HORIZONTAL_DATUM, "assumed", "Longitude and latitude are in WGS 84."),
         _OTHER_BODY,
         _IN_COMMENT,
         _NO_DATUM,
-        Treatment(Subject.UNIT, "assumed", "metres"),
+        Treatment(Subject.UNIT, "assumed", "Heights are in metres."),
         _FEET_IN_COMMENT,
-        Treatment(Subject.PIXEL_ORIGIN, "assumed", "the centre of the first pixel is (0, 0)"),
-        Treatment(Subject.ORDER, "refused", "a comment that states longitude before latitude"),
+        Treatment(Subject.PIXEL_ORIGIN, "assumed", "The centre of the first pixel is (0, 0)."),
+        Treatment(Subject.ORDER, "refused", "A comment states that longitude comes before latitude."),
         Treatment(
-            Subject.ACCURACY, "used", "sigmas on the ground that are equal, or whose axes are stated"
+            Subject.ACCURACY,
+            "used",
+            "The three sigmas of a ground position, if they are equal or if `--sigma-axes` states their "
+            "axes.",
         ),
         Treatment(
             Subject.ACCURACY,
             "named",
-            "sigmas on the ground that differ, without their axes; of fixed points",
+            "Unequal sigmas of a ground position without stated axes, and the tiny sigmas that mark "
+            "fixed points.",
         ),
         _EPOCH,
         _FILE_NAMES,
-        Treatment(Subject.IDENTITY, "refused", "images in two folders with one file name"),
+        Treatment(
+            Subject.IDENTITY, "refused", "Two images in different folders have the same file name."
+        ),
     ),
     (*_NEVER, Subject.VALIDITY),
 )
@@ -66,19 +81,40 @@ QGIS_READER = Reader(
     "QGIS `.points`",
     ("parse_qgis_points",),
     (
-        Treatment(Subject.HORIZONTAL_DATUM, "used", "`#CRS:`, a code or WKT, in any comment"),
-        Treatment(Subject.HORIZONTAL_DATUM, "refused", "none, not understood, or of another body"),
+        Treatment(Subject.HORIZONTAL_DATUM, "used", "A comment `#CRS:` states a code or WKT."),
+        Treatment(
+            Subject.HORIZONTAL_DATUM,
+            "refused",
+            "The file states no system, or one that cannot be understood or is not of the Earth.",
+        ),
         _FEET_IN_COMMENT,
         Treatment(
             Subject.PIXEL_ORIGIN,
             "assumed",
-            "the corner of the first pixel is (0, 0), lines are negative",
+            "The corner of the first pixel is (0, 0), and lines are negative numbers.",
         ),
-        Treatment(Subject.PIXEL_ORIGIN, "refused", "coordinates of a map in place of pixels"),
-        Treatment(Subject.ORDER, "refused", "a row of more fields than columns, as with decimal commas"),
-        Treatment(Subject.VALIDITY, "used", "`enable`: 1, 0, true, false"),
-        Treatment(Subject.VALIDITY, "refused", "`enable` with any other value"),
-        Treatment(Subject.ACCURACY, "named", "`dX`, `dY`, `residual` of a fit in QGIS"),
+        Treatment(
+            Subject.PIXEL_ORIGIN,
+            "refused",
+            "The image coordinates are map coordinates instead of pixels, because the image is on a "
+            "map.",
+        ),
+        Treatment(
+            Subject.ORDER,
+            "refused",
+            "A row has more fields than the header has columns, for example because of decimal commas.",
+        ),
+        Treatment(
+            Subject.VALIDITY,
+            "used",
+            "The column `enable` with 1, 0, true or false switches a point on or off.",
+        ),
+        Treatment(Subject.VALIDITY, "refused", "The column `enable` has another value."),
+        Treatment(
+            Subject.ACCURACY,
+            "named",
+            "The columns `dX`, `dY` and `residual`, which belong to a fit in QGIS.",
+        ),
         _EPOCH,
     ),
     (*_NEVER, Subject.VERTICAL_DATUM, Subject.IDENTITY),
@@ -87,16 +123,20 @@ ENVI_READER = Reader(
     "ENVI `.pts`",
     ("parse_envi_pts",),
     (
-        Treatment(Subject.HORIZONTAL_DATUM, "used", "`projection info`: Geographic or UTM with WGS-84"),
         Treatment(
-            Subject.HORIZONTAL_DATUM, "refused", "any other `projection info`, or another in a comment"
+            Subject.HORIZONTAL_DATUM, "used", "`projection info` with Geographic or UTM, and WGS-84."
+        ),
+        Treatment(
+            Subject.HORIZONTAL_DATUM,
+            "refused",
+            "`projection info` with another projection or datum, or a comment with another system.",
         ),
         _IN_COMMENT,
         _NO_DATUM,
-        Treatment(Subject.UNIT, "used", "`units` of the projection: degrees, metres"),
-        Treatment(Subject.UNIT, "assumed", "elevations in metres"),
-        Treatment(Subject.UNIT, "refused", "`units=Feet`; a comment that states feet"),
-        Treatment(Subject.PIXEL_ORIGIN, "assumed", "the corner of the first pixel is (1, 1)"),
+        Treatment(Subject.UNIT, "used", "`units` of the projection: degrees or metres."),
+        Treatment(Subject.UNIT, "assumed", "Elevations are in metres."),
+        Treatment(Subject.UNIT, "refused", "`units=Feet`, or a comment that states feet."),
+        Treatment(Subject.PIXEL_ORIGIN, "assumed", "The corner of the first pixel is (1, 1)."),
         _EXCHANGED,
         _ACCURACY,
         _EPOCH,
@@ -107,18 +147,22 @@ PCI_READER = Reader(
     "PCI OrthoEngine text",
     ("parse_pci_text",),
     (
-        Treatment(Subject.HORIZONTAL_DATUM, "used", "`crs=` of the first line"),
+        Treatment(Subject.HORIZONTAL_DATUM, "used", "`crs=` in the first line."),
         _OTHER_BODY,
-        Treatment(Subject.VERTICAL_DATUM, "used", "`heights=` of the first line"),
+        Treatment(Subject.VERTICAL_DATUM, "used", "`heights=` in the first line."),
         _NO_DATUM,
-        Treatment(Subject.UNIT, "assumed", "heights in metres"),
+        Treatment(Subject.UNIT, "assumed", "Heights are in metres."),
         _FEET_IN_COMMENT,
-        Treatment(Subject.PIXEL_ORIGIN, "assumed", "the corner of the first pixel is (0, 0)"),
-        Treatment(Subject.ORDER, "used", "`layout=` of the first line"),
+        Treatment(Subject.PIXEL_ORIGIN, "assumed", "The corner of the first pixel is (0, 0)."),
+        Treatment(Subject.ORDER, "used", "`layout=` in the first line states the order of the columns."),
         _EXCHANGED,
-        Treatment(Subject.VALIDITY, "used", "column S: G, I, C"),
-        Treatment(Subject.VALIDITY, "refused", "column S with any other letter"),
-        Treatment(Subject.ACCURACY, "named", "eX, eY, eZ, which PCI defines in pixels"),
+        Treatment(
+            Subject.VALIDITY,
+            "used",
+            "Column S: G is a control point, I is an inactive point, C is a check point.",
+        ),
+        Treatment(Subject.VALIDITY, "refused", "Column S contains another letter."),
+        Treatment(Subject.ACCURACY, "named", "The columns eX, eY and eZ, which PCI defines in pixels."),
         _EPOCH,
     ),
     (*_NEVER, Subject.IDENTITY),
@@ -128,24 +172,36 @@ ODM_READER = Reader(
     ("parse_gcp_list",),
     (
         Treatment(
-            Subject.HORIZONTAL_DATUM, "used", "first line: code, PROJ string, `WGS84 UTM 31N`, WKT"
+            Subject.HORIZONTAL_DATUM,
+            "used",
+            "The first line: a code, a PROJ string, a name such as `WGS84 UTM 31N`, or WKT.",
         ),
         Treatment(
-            Subject.HORIZONTAL_DATUM, "assumed", "the northern zone, of `WGS84 UTM 31` without N or S"
+            Subject.HORIZONTAL_DATUM, "assumed", "`WGS84 UTM 31` without N or S means the northern zone."
         ),
         _OTHER_BODY,
-        Treatment(Subject.VERTICAL_DATUM, "used", "of a reference system with heights; in a comment"),
+        Treatment(
+            Subject.VERTICAL_DATUM,
+            "used",
+            "The first line states a reference system with heights, or a comment states the datum.",
+        ),
         _NO_DATUM,
-        Treatment(Subject.UNIT, "used", "of a reference system with heights; the same in a comment"),
-        Treatment(Subject.UNIT, "assumed", "the unit of a projected reference system; else metres"),
+        Treatment(
+            Subject.UNIT, "used", "The unit of a reference system with heights, or a unit in a comment."
+        ),
+        Treatment(
+            Subject.UNIT,
+            "assumed",
+            "Heights have the unit of a projected reference system; otherwise they are in metres.",
+        ),
         _FEET_IN_COMMENT,
-        Treatment(Subject.PIXEL_ORIGIN, "assumed", "the centre of the first pixel is (0, 0)"),
+        Treatment(Subject.PIXEL_ORIGIN, "assumed", "The centre of the first pixel is (0, 0)."),
         _EXCHANGED,
-        Treatment(Subject.VALIDITY, "used", "names that begin with CHK- are check points"),
+        Treatment(Subject.VALIDITY, "used", "Points whose names begin with CHK- are check points."),
         _ACCURACY,
         _EPOCH,
         _FILE_NAMES,
-        Treatment(Subject.IDENTITY, "named", "fields after the name of the point"),
+        Treatment(Subject.IDENTITY, "named", "Fields after the name of the point."),
     ),
     _NEVER,
 )
@@ -154,60 +210,83 @@ CSV_READER = Reader(
     ("parse_csv",),
     (
         Treatment(
-            Subject.HORIZONTAL_DATUM, "used", "in a comment: `# crs=EPSG:4230`; a column with WGS 84"
+            Subject.HORIZONTAL_DATUM,
+            "used",
+            "A comment such as `# crs=EPSG:4230`, or a column that states WGS 84.",
         ),
-        Treatment(Subject.HORIZONTAL_DATUM, "assumed", "lon and lat are WGS 84"),
         Treatment(
-            Subject.HORIZONTAL_DATUM, "named", "a column with zones or codes, where `--crs` is given"
+            Subject.HORIZONTAL_DATUM, "assumed", "Columns of longitude and latitude are in WGS 84."
+        ),
+        Treatment(
+            Subject.HORIZONTAL_DATUM,
+            "named",
+            "A column with zones or codes, if you state the system with `--crs`. Columns of a second "
+            "position.",
         ),
         Treatment(
             Subject.HORIZONTAL_DATUM,
             "refused",
-            "none of x and y; a column with another datum; another body",
+            "Columns x and y without a stated system (`--crs`), a column that states another datum, or "
+            "a system that is not of the Earth.",
         ),
         Treatment(
             Subject.VERTICAL_DATUM,
             "used",
-            "in the name of the column: `h_ell`, `height_egm96`; in a comment",
+            "The name of the height column, such as `h_ell` or `height_egm96`, or a comment.",
         ),
         Treatment(
-            Subject.VERTICAL_DATUM, "named", "columns of other heights, and of the height of the geoid"
+            Subject.VERTICAL_DATUM,
+            "named",
+            "Further columns of heights, the height of the geoid, and the name of a datum in a column, "
+            "if another statement decides.",
         ),
         Treatment(
             Subject.VERTICAL_DATUM,
             "refused",
-            "none; another one than the caller states; several columns of heights; a column that may "
-            "have heights and is not understood",
+            "No datum is stated, or you state another datum than the file. Also refused are several "
+            "columns of heights, and a column that may contain heights but has a name that Amers does "
+            "not understand.",
         ),
         Treatment(
             Subject.UNIT,
             "used",
-            "in the name of the column: `height_ft`, `z [cm]`, `h (US survey feet)`",
+            "The name of the column, such as `height_ft`, `z [cm]` or `h (US survey feet)`.",
         ),
-        Treatment(Subject.UNIT, "assumed", "heights in metres, where the column names no unit"),
+        Treatment(Subject.UNIT, "assumed", "Heights are in metres if the column names no unit."),
         Treatment(
             Subject.UNIT,
             "refused",
-            "x and y in another unit than their reference system; heights without a unit beside feet; a "
-            "column with another unit than metres",
+            "Columns x and y name another unit than their reference system has. Heights have no unit "
+            "although x and y are in feet. A column states another unit than metres.",
         ),
-        Treatment(Subject.PIXEL_ORIGIN, "used", "in a comment: `# pixel-origin=centre`"),
-        Treatment(Subject.PIXEL_ORIGIN, "named", "columns line and sample whose origin is not stated"),
-        Treatment(Subject.PIXEL_ORIGIN, "refused", "an origin that is not known"),
+        Treatment(Subject.PIXEL_ORIGIN, "used", "A comment such as `# pixel-origin=centre`."),
+        Treatment(Subject.PIXEL_ORIGIN, "named", "Columns of line and sample without a stated origin."),
         Treatment(
-            Subject.ORDER, "assumed", "x is east, y is north, also where the axes of the system differ"
+            Subject.PIXEL_ORIGIN, "refused", "The comment states an origin that Amers does not know."
         ),
         Treatment(
-            Subject.ORDER, "refused", "longitudes with N or S; x and y exchanged; decimal commas mixed"
+            Subject.ORDER,
+            "assumed",
+            "x is east and y is north, even if the reference system has other axes.",
         ),
-        Treatment(Subject.VALIDITY, "used", "columns active, enabled, check with 1, 0, true, false"),
-        Treatment(Subject.VALIDITY, "named", "a column such as status with other words"),
-        Treatment(Subject.ACCURACY, "used", "columns `sigma_…_m`, also in other units"),
-        Treatment(Subject.ACCURACY, "named", "any other: CE90, LE90, RMSE, DOP"),
-        Treatment(Subject.EPOCH, "named", "a column or a comment"),
+        Treatment(
+            Subject.ORDER,
+            "refused",
+            "Longitudes have the letter N or S, x and y are exchanged, or decimal commas and decimal "
+            "points are mixed.",
+        ),
+        Treatment(
+            Subject.VALIDITY, "used", "Columns active, enabled and check with 1, 0, true or false."
+        ),
+        Treatment(Subject.VALIDITY, "named", "A column such as status that contains other words."),
+        Treatment(
+            Subject.ACCURACY, "used", "Columns `sigma_…_m`, also with other units in their names."
+        ),
+        Treatment(Subject.ACCURACY, "named", "Other accuracies: CE90, LE90, RMSE, DOP."),
+        Treatment(Subject.EPOCH, "named", "An epoch in a column or in a comment."),
         _FILE_NAMES,
-        Treatment(Subject.IDENTITY, "named", "any other column"),
-        Treatment(Subject.IDENTITY, "refused", "a point with two positions"),
+        Treatment(Subject.IDENTITY, "named", "All other columns."),
+        Treatment(Subject.IDENTITY, "refused", "Two rows give one point different positions."),
     ),
     _NEVER,
 )
@@ -215,30 +294,43 @@ GEOJSON_READER = Reader(
     "GeoJSON of points",
     ("parse_geojson_points",),
     (
-        Treatment(Subject.HORIZONTAL_DATUM, "used", "member `crs` of older GeoJSON"),
-        Treatment(Subject.HORIZONTAL_DATUM, "assumed", "WGS 84, by RFC 7946"),
+        Treatment(Subject.HORIZONTAL_DATUM, "used", "The member `crs` of older GeoJSON."),
         Treatment(
-            Subject.HORIZONTAL_DATUM, "named", "`coordRefSys` of JSON-FG: its `geometry` is in WGS 84"
+            Subject.HORIZONTAL_DATUM, "assumed", "Coordinates are in WGS 84, as RFC 7946 requires."
+        ),
+        Treatment(
+            Subject.HORIZONTAL_DATUM,
+            "named",
+            "`coordRefSys` of JSON-FG, because `geometry` is in WGS 84 there.",
         ),
         _OTHER_BODY,
-        Treatment(Subject.VERTICAL_DATUM, "used", "member `heights` of Amers"),
-        Treatment(Subject.VERTICAL_DATUM, "named", "properties with other heights than the coordinates"),
+        Treatment(Subject.VERTICAL_DATUM, "used", "The member `heights`, which Amers writes."),
         Treatment(
-            Subject.VERTICAL_DATUM, "refused", "no third coordinate, or 0 beside a property with heights"
+            Subject.VERTICAL_DATUM,
+            "named",
+            "Properties that contain heights in addition to the coordinates.",
         ),
-        Treatment(Subject.UNIT, "named", "a property"),
-        Treatment(Subject.PIXEL_ORIGIN, "used", "member `pixel_origin` of Amers"),
-        Treatment(Subject.PIXEL_ORIGIN, "assumed", "the centre of the first pixel is (0, 0)"),
-        Treatment(Subject.PIXEL_ORIGIN, "refused", "any other"),
         Treatment(
-            Subject.ORDER, "refused", "a latitude beyond 90 degrees; x and y exchanged in their system"
+            Subject.VERTICAL_DATUM,
+            "refused",
+            "The third coordinate is missing, or it is 0 and a property contains a height.",
         ),
-        Treatment(Subject.VALIDITY, "used", "properties status and check"),
-        Treatment(Subject.ACCURACY, "used", "properties `sigma_…`"),
-        Treatment(Subject.ACCURACY, "named", "any other property"),
-        Treatment(Subject.EPOCH, "named", "`coordinateEpoch`, or a property"),
+        Treatment(Subject.UNIT, "named", "A property that states a unit."),
+        Treatment(Subject.PIXEL_ORIGIN, "used", "The member `pixel_origin`, which Amers writes."),
+        Treatment(Subject.PIXEL_ORIGIN, "assumed", "The centre of the first pixel is (0, 0)."),
+        Treatment(Subject.PIXEL_ORIGIN, "refused", "`pixel_origin` states another origin."),
+        Treatment(
+            Subject.ORDER,
+            "refused",
+            "A latitude is above 90 degrees, or the points are in the area of their system only if x "
+            "and y are exchanged.",
+        ),
+        Treatment(Subject.VALIDITY, "used", "The properties status and check."),
+        Treatment(Subject.ACCURACY, "used", "The properties `sigma_…`."),
+        Treatment(Subject.ACCURACY, "named", "All other properties."),
+        Treatment(Subject.EPOCH, "named", "The member `coordinateEpoch`, or a property."),
         _FILE_NAMES,
-        Treatment(Subject.IDENTITY, "named", "any other property"),
+        Treatment(Subject.IDENTITY, "named", "All other properties."),
     ),
     _NEVER,
 )
@@ -246,19 +338,27 @@ OPF_READER = Reader(
     "OPF control points",
     ("parse_opf",),
     (
-        Treatment(Subject.HORIZONTAL_DATUM, "used", "`crs` of each point"),
+        Treatment(Subject.HORIZONTAL_DATUM, "used", "The `crs` of each point."),
         _OTHER_BODY,
-        Treatment(Subject.VERTICAL_DATUM, "used", "of a `crs` with heights"),
-        Treatment(Subject.VERTICAL_DATUM, "assumed", "the ellipsoid, of a `crs` without heights"),
-        Treatment(Subject.UNIT, "used", "of the `crs`"),
-        Treatment(Subject.PIXEL_ORIGIN, "assumed", "the corner of the first pixel is (0, 0)"),
-        Treatment(Subject.ORDER, "used", "the axes of the `crs`"),
+        Treatment(Subject.VERTICAL_DATUM, "used", "A `crs` with heights."),
+        Treatment(
+            Subject.VERTICAL_DATUM,
+            "assumed",
+            "With a `crs` without heights, heights are above the ellipsoid.",
+        ),
+        Treatment(Subject.UNIT, "used", "The unit of the `crs`."),
+        Treatment(Subject.PIXEL_ORIGIN, "assumed", "The corner of the first pixel is (0, 0)."),
+        Treatment(Subject.ORDER, "used", "The order of the axes of the `crs`."),
         _EXCHANGED,
-        Treatment(Subject.VALIDITY, "used", "`is_checkpoint`"),
-        Treatment(Subject.ACCURACY, "used", "`sigmas`, `accuracy`"),
-        Treatment(Subject.EPOCH, "named", "`epoch` of a `crs`"),
-        Treatment(Subject.IDENTITY, "assumed", "ids of cameras are the names of images"),
-        Treatment(Subject.IDENTITY, "named", "manual tie points"),
+        Treatment(Subject.VALIDITY, "used", "`is_checkpoint` marks check points."),
+        Treatment(Subject.ACCURACY, "used", "`sigmas` and `accuracy`."),
+        Treatment(Subject.EPOCH, "named", "The `epoch` of a `crs`."),
+        Treatment(
+            Subject.IDENTITY,
+            "assumed",
+            "If the file names no images, the ids of cameras are used as the names of images.",
+        ),
+        Treatment(Subject.IDENTITY, "named", "Manual tie points."),
     ),
     _NEVER,
 )
@@ -266,13 +366,21 @@ GCPLIB_READER = Reader(
     "USGS GCPLib",
     ("parse_gcplib",),
     (
-        Treatment(Subject.HORIZONTAL_DATUM, "assumed", "WGS 84"),
+        Treatment(Subject.HORIZONTAL_DATUM, "assumed", "Longitude and latitude are in WGS 84."),
         _NO_DATUM,
-        Treatment(Subject.UNIT, "assumed", "elevations in metres"),
-        Treatment(Subject.ORDER, "used", "y before x on the map, compared with latitude and longitude"),
-        Treatment(Subject.ORDER, "refused", "a position on the map that is not that of the degrees"),
-        Treatment(Subject.EPOCH, "named", "date of the image of the chip"),
-        Treatment(Subject.ACCURACY, "named", "ABS or REL"),
+        Treatment(Subject.UNIT, "assumed", "Elevations are in metres."),
+        Treatment(
+            Subject.ORDER,
+            "used",
+            "The map coordinates are y before x. Amers compares them with latitude and longitude.",
+        ),
+        Treatment(
+            Subject.ORDER,
+            "refused",
+            "The map coordinates and the longitude and latitude are different positions.",
+        ),
+        Treatment(Subject.EPOCH, "named", "The date of the image from which the chip was cut."),
+        Treatment(Subject.ACCURACY, "named", "The flag ABS or REL."),
     ),
     (*_NEVER, Subject.PIXEL_ORIGIN, Subject.VALIDITY, Subject.IDENTITY),
 )
@@ -280,14 +388,22 @@ COPERNICUS_READER = Reader(
     "Copernicus Sentinel-2 GCP database",
     ("parse_copernicus",),
     (
-        Treatment(Subject.HORIZONTAL_DATUM, "assumed", "WGS 84"),
-        Treatment(Subject.HORIZONTAL_DATUM, "refused", "an `EPSG` that is no UTM zone of WGS 84"),
+        Treatment(Subject.HORIZONTAL_DATUM, "assumed", "Longitude and latitude are in WGS 84."),
+        Treatment(Subject.HORIZONTAL_DATUM, "refused", "`EPSG` is not a UTM zone of WGS 84."),
         _NO_DATUM,
-        Treatment(Subject.UNIT, "used", "`@unit` of `Altimetry`"),
-        Treatment(Subject.UNIT, "refused", "no known unit of length"),
-        Treatment(Subject.ORDER, "used", "`X`, `Y`, compared with longitude and latitude"),
-        Treatment(Subject.ORDER, "refused", "a position on the map that is not that of the degrees"),
-        Treatment(Subject.ACCURACY, "named", "`Quality_Indicators`"),
+        Treatment(Subject.UNIT, "used", "`@unit` of `Altimetry`."),
+        Treatment(Subject.UNIT, "refused", "`@unit` is not a known unit of length."),
+        Treatment(
+            Subject.ORDER,
+            "used",
+            "The map coordinates are `X`, then `Y`. Amers compares them with longitude and latitude.",
+        ),
+        Treatment(
+            Subject.ORDER,
+            "refused",
+            "The map coordinates and the longitude and latitude are different positions.",
+        ),
+        Treatment(Subject.ACCURACY, "named", "`Quality_Indicators`."),
     ),
     (*_NEVER, Subject.PIXEL_ORIGIN, Subject.VALIDITY, Subject.EPOCH, Subject.IDENTITY),
 )

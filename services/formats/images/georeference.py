@@ -27,13 +27,19 @@ AUX_READER = Reader(
         Treatment(
             Subject.MODEL,
             "used",
-            "The domain RPC, in GDAL's order after the tags of a GeoTIFF.",
+            "The metadata domain RPC. In the order of GDAL, it comes after the tags of a GeoTIFF.",
         ),
-        Treatment(Subject.MODEL, "refused", "A number of the RPC that is missing."),
-        Treatment(Subject.PLACE, "used", "GeoTransform, before that of the image itself."),
-        Treatment(Subject.PLACE, "refused", "A GeoTransform that is not six numbers."),
-        Treatment(Subject.HORIZONTAL_DATUM, "used", "SRS, before that of the image itself."),
-        Treatment(Subject.HORIZONTAL_DATUM, "refused", "A SRS that is not WKT."),
+        Treatment(Subject.MODEL, "refused", "A number of the RPC is missing."),
+        Treatment(
+            Subject.PLACE, "used", "GeoTransform. It has precedence over the geotransform of the image."
+        ),
+        Treatment(Subject.PLACE, "refused", "GeoTransform does not consist of six numbers."),
+        Treatment(
+            Subject.HORIZONTAL_DATUM,
+            "used",
+            "SRS. It has precedence over the reference system of the image.",
+        ),
+        Treatment(Subject.HORIZONTAL_DATUM, "refused", "SRS is not WKT."),
     ),
     never=(
         Subject.PIXEL_ORIGIN,
@@ -52,13 +58,19 @@ WORLD_FILE_READER = Reader(
     (),
     (
         Treatment(
-            Subject.PLACE, "used", "Where neither the image nor its `.aux.xml` has a geotransform."
+            Subject.PLACE,
+            "used",
+            "The world file, if neither the image nor its `.aux.xml` file has a geotransform.",
         ),
-        Treatment(Subject.PLACE, "named", "A geotransform that differs from that of the image."),
-        Treatment(Subject.PLACE, "refused", "A file that is not six numbers."),
-        Treatment(Subject.HORIZONTAL_DATUM, "used", "The `.prj`, where nothing else states a system."),
         Treatment(
-            Subject.HORIZONTAL_DATUM, "refused", "None in a `.prj` either, or one that is not WKT."
+            Subject.PLACE, "named", "The world file, if its geotransform differs from that of the image."
+        ),
+        Treatment(Subject.PLACE, "refused", "The world file does not consist of six numbers."),
+        Treatment(Subject.HORIZONTAL_DATUM, "used", "The `.prj` file, if nothing else states a system."),
+        Treatment(
+            Subject.HORIZONTAL_DATUM,
+            "refused",
+            "The image and a `.prj` file state no system, or the content of the `.prj` file is not WKT.",
         ),
     ),
     never=(

@@ -10,37 +10,44 @@ READER = Reader(
         Treatment(
             Subject.VALIDITY,
             "used",
-            "The first of: a mask inside the file, one beside it (`NAME.msk`), an alpha band of any "
-            "number, nodata (of the file, of `NAME.aux.xml`, of a DIMAP document). A mean of bands has "
-            "no data where none of them has.",
+            "The first that exists of: a mask inside the file, a mask file next to it (`NAME.msk`), an "
+            "alpha band with any band number, a nodata value (of the file, of `NAME.aux.xml`, or of a "
+            "DIMAP document). A mean of bands has no data where none of the bands has data.",
         ),
         Treatment(
             Subject.VALIDITY,
             "named",
-            "Those that come after; an alpha whose values are a range of grey, which is a band of the "
-            "image; a `NAME.msk` that is no mask of all bands.",
+            "All later ones of this list. An alpha band with a range of grey values, which is used as a "
+            "band of the image. A `NAME.msk` that is not a mask of all bands.",
         ),
-        Treatment(Subject.VALIDITY, "refused", "A `NAME.msk` of another size."),
+        Treatment(Subject.VALIDITY, "refused", "`NAME.msk` has another size than the image."),
         Treatment(
             Subject.BANDS,
             "used",
-            "Those of `--bands`; the mean of red, green and blue that lie within 0.3 px of each other; "
-            "brightness (Y, lightness); the grey of the colours of a colour table.",
+            "The bands of `--bands`. Without this option: the mean of red, green and blue, if they "
+            "match within 0.3 px; a band of brightness (Y, lightness); the grey value of the colours of "
+            "a colour table.",
         ),
         Treatment(
             Subject.BANDS,
             "assumed",
-            "The first three bands where none has a colour, or the first of two; the middle band alone "
-            "where bands lie farther apart, or cannot be compared.",
+            "If no band has a colour, the mean of the first three bands, or the first of two bands. If "
+            "the bands do not match within 0.3 px or cannot be compared, the middle band alone.",
         ),
         Treatment(
             Subject.BANDS,
             "refused",
-            "Bands that the file does not have; inks, hue and saturation; a colour table among other "
-            "bands; complex numbers.",
+            "Bands that the file does not have, inks, hue and saturation, a colour table together with "
+            "other bands, and complex numbers.",
         ),
-        Treatment(Subject.UNIT, "named", "Unit, scale and offset: only the contrast of a scene counts."),
-        Treatment(Subject.IDENTITY, "named", "Further images in the file: the first is read."),
+        Treatment(
+            Subject.UNIT,
+            "named",
+            "Unit, scale and offset, because only the contrast of a scene matters.",
+        ),
+        Treatment(
+            Subject.IDENTITY, "named", "Further images in the file, because the first image is read."
+        ),
     ),
     (
         Subject.MODEL,
@@ -59,16 +66,21 @@ MASK_READER = Reader(
     (),
     (
         Treatment(
-            Subject.VALIDITY, "used", "Pixels that are not 0 are excluded; its nodata excludes none."
+            Subject.VALIDITY,
+            "used",
+            "Pixels that are not 0 are excluded. Nodata pixels of the mask exclude nothing.",
         ),
-        Treatment(Subject.PLACE, "used", "Its map grid, in any reference system."),
+        Treatment(Subject.PLACE, "used", "The map grid of the mask, in any reference system."),
         Treatment(
-            Subject.PLACE, "assumed", "The frame of the image, of a mask on no map with its proportions."
+            Subject.PLACE,
+            "assumed",
+            "A mask without a map grid covers the whole image, if it has the same proportions.",
         ),
         Treatment(
             Subject.PLACE,
             "refused",
-            "A map grid that does not cover the image, or of an image on no map; other proportions.",
+            "The map grid does not cover the image, the mask has a map grid but the image has none, or "
+            "the proportions differ.",
         ),
     ),
     (

@@ -44,18 +44,50 @@ READER = Reader(
     "Scenes: RPC and place in GeoTIFF, JPEG 2000 and NITF",
     ("read_scene",),
     (
-        Treatment(Subject.MODEL, "used", "The first of GDAL's order: files of vendors, tags, others."),
-        Treatment(Subject.MODEL, "named", "Any other model that differs by 0.01 px or more."),
-        Treatment(Subject.MODEL, "refused", "No model, or ground control points in its place."),
-        Treatment(Subject.PLACE, "used", "ICHIPB of a NITF; the geotransform of a crop or a reduction."),
-        Treatment(Subject.PLACE, "assumed", "A tile by its name, whose model has the tile's own name."),
-        Treatment(Subject.PLACE, "named", "A map grid of an image with a sensor model."),
-        Treatment(Subject.PLACE, "refused", "A crop whose RPC may be of the crop or of the full image."),
-        Treatment(Subject.ACCURACY, "used", "ERR_BIAS and ERR_RAND of tags and RPC00B."),
-        Treatment(Subject.ACCURACY, "named", "The same, where --sigma-m states another."),
-        Treatment(Subject.ACCURACY, "assumed", "That of the sensor, else 50 m."),
-        Treatment(Subject.IDENTITY, "used", "MISSION, IMAGING_DATE of tags, IDATIM of a NITF."),
-        Treatment(Subject.HORIZONTAL_DATUM, "used", "The system of an ortho-image."),
+        Treatment(
+            Subject.MODEL,
+            "used",
+            "The first model in the order of GDAL: files of vendors, tags of the image, other files.",
+        ),
+        Treatment(
+            Subject.MODEL,
+            "named",
+            "Every other model that differs from the used model by 0.01 px or more, or cannot be read.",
+        ),
+        Treatment(
+            Subject.MODEL,
+            "refused",
+            "There is no model, or there are only ground control points, to which no model is fitted.",
+        ),
+        Treatment(
+            Subject.PLACE, "used", "ICHIPB of a NITF, or the geotransform of a cropped or reduced image."
+        ),
+        Treatment(
+            Subject.PLACE,
+            "assumed",
+            "If an image is a tile by its name, a model with the name of the tile is the model of the "
+            "tile.",
+        ),
+        Treatment(Subject.PLACE, "named", "The map grid of an image that has a sensor model."),
+        Treatment(
+            Subject.PLACE,
+            "refused",
+            "A cropped image whose RPC may belong to the crop or to the full image. State "
+            "`--crop-origin`.",
+        ),
+        Treatment(Subject.ACCURACY, "used", "ERR_BIAS and ERR_RAND of tags and of RPC00B."),
+        Treatment(
+            Subject.ACCURACY, "named", "ERR_BIAS and ERR_RAND, if `--sigma-m` states another accuracy."
+        ),
+        Treatment(
+            Subject.ACCURACY,
+            "assumed",
+            "The accuracy of the sensor, if Amers knows the sensor; otherwise 50 m.",
+        ),
+        Treatment(
+            Subject.IDENTITY, "used", "MISSION and IMAGING_DATE of the tags, and IDATIM of a NITF."
+        ),
+        Treatment(Subject.HORIZONTAL_DATUM, "used", "The reference system of an ortho-image."),
     ),
     never=(
         Subject.PIXEL_ORIGIN,

@@ -29,23 +29,39 @@ READER = Reader(
     ("parse_dimap_rpc", "parse_dimap_acquisition", "parse_dimap_pixel_codes"),
     (
         Treatment(
-            Subject.MODEL, "used", "Inverse_Model of version 2, GroundtoImage_Values of version 3."
+            Subject.MODEL, "used", "Inverse_Model in version 2, GroundtoImage_Values in version 3."
         ),
-        Treatment(Subject.MODEL, "refused", "Another version, or a number that is missing."),
-        Treatment(Subject.PIXEL_ORIGIN, "used", "From (1, 1) in version 2, as the domain states in 3."),
-        Treatment(Subject.PLACE, "used", "The tile that `DIM_….XML` lists, or `_R2C1` in a name."),
+        Treatment(Subject.MODEL, "refused", "The document has another version, or a number is missing."),
         Treatment(
-            Subject.PLACE, "refused", "A tile without `DIM_….XML`, or of another size than it states."
+            Subject.PIXEL_ORIGIN,
+            "used",
+            "The first pixel is (1, 1) in version 2. In version 3, the domain of the model states it.",
+        ),
+        Treatment(
+            Subject.PLACE,
+            "used",
+            "The position of the tile that `DIM_….XML` lists. A part such as `_R2C1` of the file name "
+            "identifies the tile.",
+        ),
+        Treatment(
+            Subject.PLACE,
+            "refused",
+            "A tile without `DIM_….XML`, or with another size than this document states.",
         ),
         Treatment(
             Subject.PLACE,
             "assumed",
-            "An image of another size than the domain begins at its first pixel.",
+            "If the image has another size than the domain of the model, both begin at the same first "
+            "pixel.",
         ),
-        Treatment(Subject.VALIDITY, "used", "Special values NODATA and SATURATED of `DIM_….XML`."),
-        Treatment(Subject.ACCURACY, "named", "Errors of the fit of the polynomials."),
-        Treatment(Subject.ACCURACY, "assumed", "That of the sensor."),
-        Treatment(Subject.IDENTITY, "used", "Mission, time and sun of `DIM_….XML`."),
+        Treatment(Subject.VALIDITY, "used", "The special values NODATA and SATURATED of `DIM_….XML`."),
+        Treatment(
+            Subject.ACCURACY,
+            "named",
+            "The errors of the fit of the polynomials, which are not the accuracy of the scene.",
+        ),
+        Treatment(Subject.ACCURACY, "assumed", "The accuracy of the sensor."),
+        Treatment(Subject.IDENTITY, "used", "Mission, time and sun angles of `DIM_….XML`."),
     ),
     never=(
         Subject.HORIZONTAL_DATUM,

@@ -28,17 +28,23 @@ READER = Reader(
     ("parse_geom", "parse_geom_acquisition"),
     (
         Treatment(Subject.MODEL, "used", "The RPC, with its current adjustment applied."),
-        Treatment(Subject.MODEL, "refused", "An adjustment that an RPC cannot express, or no RPC."),
-        Treatment(Subject.PIXEL_ORIGIN, "used", "Half pixels that the loaders of two sensors lose."),
-        Treatment(Subject.ORDER, "refused", "A polynomial_format other than A and B, which are used."),
+        Treatment(
+            Subject.MODEL, "refused", "The file has no RPC, or an adjustment that an RPC cannot express."
+        ),
+        Treatment(
+            Subject.PIXEL_ORIGIN,
+            "used",
+            "Amers corrects the half pixel that the OSSIM loaders of two sensors lose.",
+        ),
+        Treatment(Subject.ORDER, "refused", "polynomial_format is neither A nor B."),
         Treatment(
             Subject.PLACE,
             "used",
-            "The geotransform of an OTB crop, where the range of the RPC "
-            "decides whether it is of the full image.",
+            "The geotransform of an image that OTB cropped. The range of the RPC decides whether the "
+            "RPC belongs to the full image.",
         ),
-        Treatment(Subject.ACCURACY, "used", "bias_error and rand_error, where they are positive."),
-        Treatment(Subject.IDENTITY, "used", "sensor, image_date and the angles of the sun."),
+        Treatment(Subject.ACCURACY, "used", "bias_error and rand_error, if they are positive."),
+        Treatment(Subject.IDENTITY, "used", "sensor, image_date and the sun angles."),
     ),
     never=(
         Subject.HORIZONTAL_DATUM,

@@ -24,10 +24,13 @@ READER = Reader(
         Treatment(
             Subject.PLACE,
             "used",
-            "Regular_Tiling, or the offsets of a `.TIL`: a tile has its place, all tiles are one image.",
+            "Regular_Tiling, or the offsets of a `.TIL` file. They state the position of each tile, and "
+            "all tiles are read as one image.",
         ),
-        Treatment(Subject.PLACE, "refused", "Tiles that are missing, overlap or have another size."),
-        Treatment(Subject.UNIT, "refused", "tileUnits that are not Pixels."),
+        Treatment(
+            Subject.PLACE, "refused", "Tiles are missing, overlap, or have another size than stated."
+        ),
+        Treatment(Subject.UNIT, "refused", "tileUnits is not Pixels."),
         Treatment(Subject.MODEL, "used", "The RPC of the whole image."),
         Treatment(
             Subject.BANDS,

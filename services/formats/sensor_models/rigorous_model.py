@@ -22,18 +22,26 @@ READER = Reader(
         Treatment(
             Subject.MODEL,
             "used",
-            "Where there is no RPC an RPC is fitted to it; with --rigorous itself.",
+            "If there is no RPC, an RPC is fitted to the rigorous model. With `--rigorous`, the "
+            "rigorous model itself is used.",
         ),
         Treatment(
             Subject.MODEL,
             "named",
-            "Orbit and attitude, where the RPC is: scene register-many --rigorous adjusts them.",
+            "Orbit and attitude, if the RPC is used. `amers scene register-many --rigorous` adjusts "
+            "them.",
         ),
-        Treatment(Subject.MODEL, "refused", "A value that is missing, impossible or not supported."),
+        Treatment(Subject.MODEL, "refused", "A value is missing, impossible or not supported."),
         Treatment(
-            Subject.IDENTITY, "used", "The name of the product, where all images are called IMAGERY."
+            Subject.IDENTITY,
+            "used",
+            "The name of the product, because all images have the name IMAGERY.",
         ),
-        Treatment(Subject.ACCURACY, "assumed", "That of the sensor, else 50 m."),
+        Treatment(
+            Subject.ACCURACY,
+            "assumed",
+            "The accuracy of the sensor, if Amers knows the sensor; otherwise 50 m.",
+        ),
     ),
     never=(
         Subject.PLACE,

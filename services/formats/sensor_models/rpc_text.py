@@ -21,15 +21,21 @@ RPC_TEXT_READER = Reader(
     "RPC as text (`_RPC.TXT`, `.rpc`)",
     ("parse_rpc_text",),
     (
-        Treatment(Subject.MODEL, "used", "`KEY: number` or `KEY=number` on each line, in any order."),
-        Treatment(Subject.MODEL, "refused", "A key that is missing, given twice, or not a number."),
+        Treatment(Subject.MODEL, "used", "Lines `KEY: number` or `KEY=number`, in any order."),
         Treatment(
-            Subject.UNIT, "refused", "Units other than pixels, degrees and metres after a number."
+            Subject.MODEL, "refused", "A key is missing or occurs twice, or its value is not a number."
         ),
-        Treatment(Subject.ACCURACY, "used", "ERR_BIAS and ERR_RAND, metres, where they are positive."),
-        Treatment(Subject.ACCURACY, "assumed", "That of the sensor, else 50 m."),
+        Treatment(Subject.UNIT, "refused", "The unit after a number is not pixels, degrees or metres."),
+        Treatment(Subject.ACCURACY, "used", "ERR_BIAS and ERR_RAND in metres, if they are positive."),
         Treatment(
-            Subject.IDENTITY, "refused", "A line that is no number, such as the name of a satellite."
+            Subject.ACCURACY,
+            "assumed",
+            "The accuracy of the sensor, if Amers knows the sensor; otherwise 50 m.",
+        ),
+        Treatment(
+            Subject.IDENTITY,
+            "refused",
+            "A line contains text instead of a number, such as the name of a satellite.",
         ),
     ),
     never=(
@@ -48,14 +54,20 @@ RPB_READER = Reader(
     ("parse_rpb",),
     (
         Treatment(Subject.MODEL, "used", "The fields of the group IMAGE."),
-        Treatment(Subject.PLACE, "used", "The `.TIL` of the product places a tile in its image."),
         Treatment(
-            Subject.PLACE, "assumed", "A tile without a `.TIL` is taken to have a RPB of its own."
+            Subject.PLACE,
+            "used",
+            "The `.TIL` file of the product states the position of a tile in its image.",
         ),
-        Treatment(Subject.ORDER, "refused", "A SpecId that is not RPC00B."),
-        Treatment(Subject.ACCURACY, "used", "errBias and errRand, metres, where they are positive."),
-        Treatment(Subject.IDENTITY, "used", "satId, and the time of the first line in the `.IMD`."),
-        Treatment(Subject.BANDS, "named", "bandId: all bands of the image take the model."),
+        Treatment(
+            Subject.PLACE, "assumed", "Without a `.TIL` file, the RPB belongs to the tile itself."
+        ),
+        Treatment(Subject.ORDER, "refused", "SpecId is not RPC00B."),
+        Treatment(Subject.ACCURACY, "used", "errBias and errRand in metres, if they are positive."),
+        Treatment(Subject.IDENTITY, "used", "satId, and the time of the first line in the `.IMD` file."),
+        Treatment(
+            Subject.BANDS, "named", "bandId, because the model is used for all bands of the image."
+        ),
     ),
     never=(
         Subject.PIXEL_ORIGIN,

@@ -38,19 +38,28 @@ READER = Reader(
     ("parse_worldview_isd", "parse_isd_acquisition"),
     (
         Treatment(
-            Subject.MODEL, "used", "The block RPB; without one an RPC fitted to orbit and attitude."
+            Subject.MODEL,
+            "used",
+            "The block RPB. Without this block, an RPC is fitted to orbit and attitude.",
         ),
-        Treatment(Subject.MODEL, "refused", "A value that is missing or impossible."),
-        Treatment(Subject.PLACE, "used", "The `.TIL` of the product places a tile in its image."),
+        Treatment(Subject.MODEL, "refused", "A value is missing or impossible."),
+        Treatment(
+            Subject.PLACE,
+            "used",
+            "The `.TIL` file of the product states the position of a tile in its image.",
+        ),
         Treatment(
             Subject.PLACE,
             "assumed",
-            "An image of another size than NUMROWS x NUMCOLUMNS begins at the first pixel.",
+            "If the image has another size than NUMROWS x NUMCOLUMNS, both begin at the same first "
+            "pixel.",
         ),
-        Treatment(Subject.ORDER, "refused", "A SPECID that is not RPC00B."),
-        Treatment(Subject.ACCURACY, "used", "ERRBIAS and ERRRAND, metres, where they are positive."),
-        Treatment(Subject.ACCURACY, "assumed", "That of the sensor, where they are zero."),
-        Treatment(Subject.IDENTITY, "used", "SATID, FIRSTLINETIME and the angles of the sun."),
+        Treatment(Subject.ORDER, "refused", "SPECID is not RPC00B."),
+        Treatment(Subject.ACCURACY, "used", "ERRBIAS and ERRRAND in metres, if they are positive."),
+        Treatment(
+            Subject.ACCURACY, "assumed", "The accuracy of the sensor, if ERRBIAS and ERRRAND are zero."
+        ),
+        Treatment(Subject.IDENTITY, "used", "SATID, FIRSTLINETIME and the sun angles."),
     ),
     never=(
         Subject.PIXEL_ORIGIN,

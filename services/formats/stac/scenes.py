@@ -23,20 +23,31 @@ READER = Reader(
     "Items of STAC catalogues",
     ("read_catalogue", "read_item_scene"),
     (
-        Treatment(Subject.IDENTITY, "used", "`id`, `platform` and time name the image"),
-        Treatment(Subject.IDENTITY, "refused", "an id that two items have; no id"),
-        Treatment(Subject.VALIDITY, "used", "masks in GeoJSON: the ground that they hide"),
-        Treatment(Subject.VALIDITY, "named", "masks in other formats"),
-        Treatment(Subject.BANDS, "refused", "several images of which none has the role data"),
-        Treatment(Subject.HORIZONTAL_DATUM, "refused", "another than WGS 84 of a mask in GeoJSON"),
+        Treatment(Subject.IDENTITY, "used", "`id`, `platform` and the time identify the image."),
+        Treatment(Subject.IDENTITY, "refused", "Two items have the same id, or an item has no id."),
+        Treatment(
+            Subject.VALIDITY,
+            "used",
+            "Masks in GeoJSON: the ground that they cover counts as hidden in the image.",
+        ),
+        Treatment(Subject.VALIDITY, "named", "Masks in other formats."),
+        Treatment(
+            Subject.BANDS, "refused", "The item has several images, and none of them has the role data."
+        ),
+        Treatment(
+            Subject.HORIZONTAL_DATUM, "refused", "A mask in GeoJSON is in another system than WGS 84."
+        ),
         Treatment(
             Subject.HORIZONTAL_DATUM,
             "named",
-            "`proj:code` or `proj:epsg` other than that of the image, which is used",
+            "`proj:code` or `proj:epsg`, if the image states another system. The system of the image is "
+            "used.",
         ),
-        Treatment(Subject.ORDER, "refused", "latitudes beyond 90 degrees of the footprint"),
-        Treatment(Subject.ACCURACY, "named", "`accuracy:…`: what it is of differs between producers"),
-        Treatment(Subject.UNIT, "refused", "angles and shares out of their range"),
+        Treatment(Subject.ORDER, "refused", "A latitude of the footprint is above 90 degrees."),
+        Treatment(
+            Subject.ACCURACY, "named", "`accuracy:…`, because its meaning differs between producers."
+        ),
+        Treatment(Subject.UNIT, "refused", "An angle or a percentage is out of its range."),
     ),
     never=(
         Subject.MODEL,

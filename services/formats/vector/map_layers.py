@@ -20,17 +20,29 @@ READER = Reader(
     "Vectors: GeoPackage, GeoJSON, shapefile, FlatGeobuf",
     ("read_layer", "read_map_layer", "read_pixel_layer"),
     (
-        Treatment(Subject.HORIZONTAL_DATUM, "used", "reference system of vectors on a map"),
-        Treatment(Subject.HORIZONTAL_DATUM, "named", "reference system of vectors in pixel coordinates"),
-        Treatment(Subject.HORIZONTAL_DATUM, "refused", "of another body than the Earth"),
-        Treatment(Subject.VERTICAL_DATUM, "used", "of a reference system with heights, compound or not"),
-        Treatment(Subject.VERTICAL_DATUM, "assumed", "that of the terrain, in a system without heights"),
-        Treatment(Subject.VERTICAL_DATUM, "refused", "a datum whose grid is not installed"),
-        Treatment(Subject.UNIT, "used", "of a reference system with heights, such as feet"),
-        Treatment(Subject.UNIT, "assumed", "heights in metres, in a system without heights"),
-        Treatment(Subject.ORDER, "refused", "vertices in the area of their system only if exchanged"),
-        Treatment(Subject.EPOCH, "named", "coordinate epoch of a GeoPackage"),
-        Treatment(Subject.IDENTITY, "named", "other layers of the file"),
+        Treatment(Subject.HORIZONTAL_DATUM, "used", "The reference system of vectors on a map."),
+        Treatment(
+            Subject.HORIZONTAL_DATUM, "named", "The reference system of vectors in pixel coordinates."
+        ),
+        Treatment(Subject.HORIZONTAL_DATUM, "refused", "The reference system is not of the Earth."),
+        Treatment(Subject.VERTICAL_DATUM, "used", "A reference system with heights, compound or not."),
+        Treatment(
+            Subject.VERTICAL_DATUM,
+            "assumed",
+            "In a system without heights, heights have the vertical datum of the terrain.",
+        ),
+        Treatment(Subject.VERTICAL_DATUM, "refused", "The grid of the vertical datum is not installed."),
+        Treatment(
+            Subject.UNIT, "used", "The height unit of a reference system with heights, such as feet."
+        ),
+        Treatment(Subject.UNIT, "assumed", "In a system without heights, heights are in metres."),
+        Treatment(
+            Subject.ORDER,
+            "refused",
+            "The vertices are in the area of their reference system only if x and y are exchanged.",
+        ),
+        Treatment(Subject.EPOCH, "named", "The coordinate epoch of a GeoPackage."),
+        Treatment(Subject.IDENTITY, "named", "Other layers of the file."),
     ),
     (
         Subject.MODEL,
