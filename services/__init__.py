@@ -1,1 +1,1 @@
-"""The science: arrays in, arrays out. It knows no web, database, settings or clock."""
+"""Scientific computations on arrays, independent of web, database, settings and clock."""

@@ -1,4 +1,4 @@
-"""Horizontal datums: the operation that leads from a reference system to WGS 84, and its accuracy."""
+"""Horizontal datums: the transformation from a reference system to WGS 84, and its accuracy."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""The tree of errors: input that a user can correct, and data that allow no trustworthy result.
+"""Error classes: input that a user can correct, and data without a trustworthy result.
 
 AmersError
 ├── InputError              the input cannot be used; the user can correct it

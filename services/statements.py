@@ -1,4 +1,4 @@
-"""What files state about themselves, and what became of each statement: used, assumed or not used.
+"""Statements of files about their data, and how each one is treated: used, assumed or not used.
 
 A reader returns its data with a record of statements. A statement that cannot be used and that changes
 the result refuses the file; any other that is not used stands in the record, which goes to the terminal,

@@ -1,4 +1,4 @@
-"""Independent tasks: computed by any executor in any order, their results kept by name."""
+"""Independent tasks, computed by any executor in any order, with results stored by name."""
 
 import time
 from collections.abc import Callable, Mapping, MutableMapping, Sequence

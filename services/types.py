@@ -1,4 +1,4 @@
-"""Data that pass between the services: frozen dataclasses of arrays."""
+"""Data types that the services exchange: frozen dataclasses of arrays."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

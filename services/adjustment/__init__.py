@@ -1,1 +1,1 @@
-"""The adjustment of many images: a block with its tie points and its control."""
+"""Block adjustment: many images, adjusted together on tie points and control."""

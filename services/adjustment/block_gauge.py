@@ -1,4 +1,4 @@
-"""The gauge of a block: position and linear shape, which tie points do not determine and priors do."""
+"""The gauge of a block: position and linear deformation, set by priors, not by tie points."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The parts that a block is adjusted in: groups of images near each other, with their points."""
+"""Division of a large block into parts: groups of neighbouring images, with their points."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

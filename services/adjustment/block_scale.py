@@ -1,4 +1,4 @@
-"""Size of residuals relative to their stated sigmas, where a third of the observations may be wrong."""
+"""Robust scale of residuals relative to their stated sigmas, with up to a third of outliers."""
 
 import numpy as np
 from scipy.special import chdtr, chdtri

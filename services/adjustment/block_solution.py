@@ -1,4 +1,4 @@
-"""Gauss-Newton steps of a block with its points eliminated, part by part."""
+"""Gauss-Newton steps of a block: points are eliminated, part by part."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Which control points agree with the block and with each other."""
+"""Outlier tests of control points: agreement with the block and with each other."""
 
 import numpy as np
 from numba import njit

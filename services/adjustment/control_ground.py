@@ -1,4 +1,4 @@
-"""Control of a block adjustment: points whose ground positions are known, with the frames they share."""
+"""Control of a block adjustment: points with known ground positions, and their common frames."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Nested dissection: a large system is solved in groups of blocks, then on what separates them."""
+"""Nested dissection: a large system is solved in groups of blocks, then for the separators."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial

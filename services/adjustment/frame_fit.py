@@ -1,4 +1,4 @@
-"""The translation of an adjusted block onto known ground, and the accuracy of its frame after that."""
+"""Translation of an adjusted block onto known ground, and the accuracy of its frame afterwards."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Points marked in images with models that are off: positions, covariances, and marks that disagree.
+"""Intersection of marks in images with model errors: positions, covariances, and wrong marks.
 
 A model is off by an error that all points of its image share. It is solved for as a shift of the image
 with the a priori covariance of the model, together with all points: so it stays in the covariance of

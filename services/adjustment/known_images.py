@@ -1,4 +1,4 @@
-"""Images that a neighbouring block has adjusted: their parameters are observed in a new adjustment."""
+"""Images adjusted in a neighbouring block: their parameters are observations in a new adjustment."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

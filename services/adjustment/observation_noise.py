@@ -1,4 +1,4 @@
-"""The noise of image observations: how much of it is stated, how much all observations have."""
+"""Noise of image observations: the stated part, and the part that all observations have."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The parameters of the images of an adjusted block in their units, and those that stay undetermined."""
+"""Parameters of adjusted images in their units, and the parameters that stay undetermined."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

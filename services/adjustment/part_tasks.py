@@ -1,4 +1,4 @@
-"""What is computed of the equations of one part of a block, by any process: arrays in, arrays out."""
+"""Tasks on the equations of one part of a block, for any process: arrays in, arrays out."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The robust solution of a block, of which a third of the observations may be wrong."""
+"""Robust solution of a block in which up to a third of the observations may be wrong."""
 
 from dataclasses import replace
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""The entries of the inverse of a sparse matrix that lie where the matrix has entries."""
+"""Selected inverse of a sparse matrix: its entries at the non-zero entries of the matrix."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Rounds of least squares of a block and of leaving out what disagrees, until both have settled."""
+"""Rounds of least squares and outlier rejection of a block, until neither changes."""
 
 from dataclasses import dataclass, replace
 

@@ -1,1 +1,1 @@
-"""Readers and writers of files: the only package of `services` that opens any."""
+"""Readers and writers of files. No other package of `services` opens files."""

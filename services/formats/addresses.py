@@ -1,4 +1,4 @@
-"""Files in buckets and on servers, read by ranges; nothing that a stranger sends gets here.
+"""Files in buckets and on servers, read by byte ranges; never for addresses of untrusted users.
 
 GDAL has no network here: it asks a `RangeFile` for bytes, and sees neither addresses nor credentials.
 """

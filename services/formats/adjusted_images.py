@@ -1,4 +1,4 @@
-"""The adjusted images of a block in a file, for neighbouring blocks that are made later."""
+"""A file with the adjusted images of a block, for neighbouring blocks that are made later."""
 
 import zipfile
 from dataclasses import fields

@@ -1,4 +1,4 @@
-"""Files that other files refer to: their paths never leave the folder they are searched in."""
+"""Files that other files refer to: their paths cannot lead out of the folder that is searched."""
 
 from pathlib import Path
 

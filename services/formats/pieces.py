@@ -1,4 +1,4 @@
-"""The files of an image or a terrain that lies in pieces: files, folders, lists, archives, catalogues.
+"""Images and terrains that consist of several files: folders, lists, archives, catalogues.
 
 | a user names | its pieces |
 |---|---|

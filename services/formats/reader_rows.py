@@ -1,4 +1,4 @@
-"""What a reader does with each kind of statement that its files may make: one row for each reader.
+"""Treatment of each kind of statement that a file may make: one row for each reader.
 
 `docs/inputs.md` is made of these rows, and a matrix of tests has a file for each of their treatments.
 """

@@ -1,4 +1,4 @@
-"""All readers of files that others write, with what becomes of each statement in such a file."""
+"""All readers of external files, with their treatment of each statement in such a file."""
 
 from amers.services.formats import ground_masks
 from amers.services.formats.elevation.rows import TERRAIN_READERS

@@ -1,4 +1,4 @@
-"""A folder that keeps the results of tasks, whole or not at all, so that interrupted work goes on."""
+"""A folder with complete results of tasks, from which interrupted work continues."""
 
 import json
 import shutil

@@ -1,1 +1,1 @@
-"""Images without their files: pixels, gaps, scenes with their models, catalogues."""
+"""Images independent of their files: pixels, gaps, scenes with their models, catalogues."""

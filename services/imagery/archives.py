@@ -1,4 +1,4 @@
-"""Archives of ortho-images that bases are made of: names in their catalogues, stated accuracy."""
+"""Archives of ortho-images for bases: their names in catalogues, and their stated accuracy."""
 
 import math
 from collections.abc import Mapping

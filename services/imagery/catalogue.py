@@ -1,4 +1,4 @@
-"""What a catalogue states of its images, without their pixels."""
+"""Properties of images as stated by a catalogue, without pixels."""
 
 from dataclasses import dataclass
 from typing import Self

@@ -1,4 +1,4 @@
-"""Gaps of images: pixels without data (NaN) and saturated ones (+inf). Small gaps are bridged.
+"""Gaps of images: pixels without data (NaN) or saturated (+inf). Small gaps are interpolated.
 
 An output pixel is lost where gaps are more than half of its footprint: NaN where most of them have no
 data, +inf where most are saturated. Elsewhere the gaps are filled from the pixels around them.

@@ -1,4 +1,4 @@
-"""Images without the ground that clouds and the like hide, by outlines from a catalogue."""
+"""Images without the pixels inside outlines from a catalogue, such as clouds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""How far what follows a jump between two lines lies from where the lines before it would go on.
+"""Size of a jump between two lines: the number of lost lines, or the displacement of a part.
 
 Pixels differ the more the farther apart they are: the difference across the jump is that of pixels as
 many lines apart as it takes elsewhere around it. A moved part shows what lies beside it once more.

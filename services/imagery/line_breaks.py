@@ -1,4 +1,4 @@
-"""Line breaks: places in an image between whose lines others are missing, or repeated.
+"""Line breaks: places in an image where lines are missing or repeated.
 
 A scanner that loses or repeats lines leaves a trace in the pixels: across the break, neighbouring lines
 differ more than elsewhere, over the whole width of the image, and between these two lines only. No

@@ -1,4 +1,4 @@
-"""Lines that are repeated, and places between whose lines others are missing, seen in a profile."""
+"""Detection of repeated lines, and of places where lines are missing, in a profile."""
 
 from dataclasses import dataclass
 

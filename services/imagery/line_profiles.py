@@ -1,4 +1,4 @@
-"""What every line of an image, or every sample, has in common with the one before, in cells along it.
+"""Profiles: the change from each line of an image (or sample) to the next, in cells along it.
 
 The image is read once along each axis, piece by piece. Of an image wider than 2,048 pixels, four strips
 evenly over the width are read.

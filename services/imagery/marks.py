@@ -1,4 +1,4 @@
-"""Marks of known ground in images: they lie in their image, and their ground where it was taken."""
+"""Checks of marks: inside their image, with longitude and latitude in the right order."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Corners of parts with other pixels: two joints, along lines and along samples, that meet.
+"""Detection of rectangular parts with other pixels, by corners in which two joints meet.
 
 A joint differs from an edge of the ground in that it lies between two lines and leaves the lines beside
 it as they are, and in that what lies on both sides of it does not change together along it.

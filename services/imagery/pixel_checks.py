@@ -1,4 +1,4 @@
-"""What is wrong with the pixels of an image, measured on the pixels alone, before anything is matched.
+"""Detection of faults in the pixels of an image, before anything is matched.
 
 Each check is a statistic that real images do not show; its limit lies between the largest value of clean
 real images and the values of distorted ones: `docs/methods/pixel_checks.md`. Changed ground, cloud and

@@ -1,4 +1,4 @@
-"""Displacements between parts of an image by phase correlation, second images by the cepstrum, and blur.
+"""Phase correlation between parts of an image, second images by the cepstrum, and blur.
 
 All are measured in windows evenly over the image. A displacement that all windows share is estimated
 from the sum of their cross-spectra: what differs between the parts averages out, phases do not.

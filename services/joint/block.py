@@ -1,4 +1,4 @@
-"""The least squares of scenes adjusted together: tie points between them, and control points in each."""
+"""Least squares of scenes adjusted together, on tie points between them and control points."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

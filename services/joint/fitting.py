@@ -1,4 +1,4 @@
-"""Which scenes fit their block: one that does not leaves by name, and the others are adjusted again."""
+"""Selection of the scenes that fit their block; a scene that does not fit is removed by name."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The control points as measured in a scene, before it is adjusted together with others."""
+"""Control points measured in one scene, before the joint adjustment."""
 
 from contextlib import suppress
 from dataclasses import dataclass, replace

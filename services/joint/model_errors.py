@@ -1,4 +1,4 @@
-"""What an adjusted rigorous model is off by beyond the covariance of its free terms.
+"""Errors of an adjusted rigorous model beyond the covariance of its free terms.
 
 A published set frees some terms of orbit, attitude and focal length; satellites err in the others, too.
 And what people take is an RPC that was fitted to the adjusted model, which follows no attitude exactly.

@@ -1,4 +1,4 @@
-"""SCENES IN -> REGISTERED TOGETHER: control points in each, tie points between them, one solution."""
+"""Joint registration of scenes: control points in each, tie points between them, one solution."""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress

@@ -1,4 +1,4 @@
-"""The part of a chip that a scene shows where the scene ends, or lacks data, near the point."""
+"""The part of a chip that a scene shows if the scene ends or has no data near the point."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""How chips are sheared in a scene, by relief that both see from different directions.
+"""Shear between chips and a scene, caused by relief and different viewing directions.
 
 Chip and scene are compared on the horizontal plane through a point. Ground above it is displaced in each
 of them along its own line of sight, so that a slope shears one against the other.

@@ -1,4 +1,4 @@
-"""Control points matched in a scene: their chips, the views combined, every failure with its reason."""
+"""Matching of control points in a scene: chips, combined views, a reason for every failure."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

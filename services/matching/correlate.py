@@ -1,4 +1,4 @@
-"""A chip found in a scene: correlation for the pixel, least squares for the position and its sigma."""
+"""Matching of one chip in a scene: correlation to a pixel, least squares for position and sigma."""
 
 import math
 from dataclasses import dataclass

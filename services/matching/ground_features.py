@@ -1,4 +1,4 @@
-"""Features of images: small details with descriptors, found in the geometry of the ground."""
+"""Features of images: details with descriptors, detected in the geometry of the ground."""
 
 from dataclasses import dataclass, replace
 from typing import Self

@@ -1,4 +1,4 @@
-"""Displacements that grow with height: the sign of a model that belongs to another view."""
+"""Displacements that grow with height, which show that a model belongs to another view."""
 
 import numpy as np
 from scipy.special import bdtrc, gammaln

@@ -1,4 +1,4 @@
-"""Points measured by chip matching in all the images that see them."""
+"""Points measured by chip matching in all images that show them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

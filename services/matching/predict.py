@@ -1,4 +1,4 @@
-"""Predicted positions: which lie in an image, and a well-distributed selection of them."""
+"""Selection of predicted positions: inside an image, and well distributed."""
 
 import numpy as np
 

@@ -1,1 +1,1 @@
-"""The adjustment of one scene: its affine correction, and displacements that this cannot follow."""
+"""The adjustment of one scene: an affine correction, and displacements that are not affine."""

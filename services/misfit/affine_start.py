@@ -1,4 +1,4 @@
-"""The robust affine correction of one scene, from which everything else about it is looked for."""
+"""Robust affine correction of one scene, the start of all further estimates."""
 
 from dataclasses import dataclass, replace
 from functools import partial

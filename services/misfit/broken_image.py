@@ -1,4 +1,4 @@
-"""Images of which lines are missing, or repeated, at known breaks: the parts between them move apart."""
+"""Images with missing or repeated lines at known breaks: displacement between their parts."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Where control points were seen in a scene, and the misfits of its model there."""
+"""Positions of control points in a scene, and the misfits of the model there."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""The least squares: the image correction of one scene from points on known ground.
+"""Least-squares estimate of the image correction of one scene, from known ground points.
 
 Drift and skew that are too small to be seen beside the errors of the points still exist. They are not
 fixed at zero: their a priori standard deviation is estimated from the measures (empirical Bayes), and

@@ -1,4 +1,4 @@
-"""Ground that moved, separated from all other causes that displace the points of an area.
+"""Detection of displaced ground, separated from other causes of displaced points.
 
 A landslide, a quarry or a part of another image displaces an area by one vector. Where it moved by a few
 times what points scatter, its points are no outliers, and motion along lines and samples comes near to

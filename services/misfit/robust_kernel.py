@@ -1,4 +1,4 @@
-"""The robust solution, compiled: cross-validation asks for it some twenty times in every scene."""
+"""Compiled robust solution, which cross-validation computes some twenty times per scene."""
 
 import numpy as np
 from numba import njit

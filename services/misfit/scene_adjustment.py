@@ -1,4 +1,4 @@
-"""How one scene is adjusted, and what its adjustment states."""
+"""Options of the adjustment of one scene, and its result with the stated accuracy."""
 
 from dataclasses import dataclass
 

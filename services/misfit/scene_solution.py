@@ -1,4 +1,4 @@
-"""The last least-squares solution of a scene, with the agreeing measures and their errors known."""
+"""Final least-squares solution of a scene, with known inliers and known errors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

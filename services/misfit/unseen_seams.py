@@ -1,4 +1,4 @@
-"""Seams between detectors where no point lies: as many as between the points, and as large.
+"""Seams between detectors outside the points: as many and as large as between the points.
 
 Detectors that are out of place are seen by the points on both sides of their seams. Beyond the outermost
 points nothing is seen, but an image that has several seams has more of them there. They are taken for a

@@ -1,1 +1,1 @@
-"""Many scenes on one map: levelled, cut along seams where they agree, and the steps there measured."""
+"""Mosaics: many scenes on one map, levelled, cut along seams, with measured steps at the seams."""

@@ -1,4 +1,4 @@
-"""Grey values of scenes levelled: a gain and an offset a scene and band, from all overlaps together."""
+"""Levelling of grey values: a gain and an offset per scene and band, from all overlaps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Seams of a mosaic: which scene every cell of the map shows, cut where scenes agree best."""
+"""Seams of a mosaic: the scene of every cell of the map, cut where scenes are most similar."""
 
 from collections.abc import Sequence
 from typing import Any

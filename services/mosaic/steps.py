@@ -1,4 +1,4 @@
-"""Steps at the seams of a mosaic: how far one scene shows the same ground off the other, in metres."""
+"""Steps at the seams of a mosaic: displacement between both scenes of a seam, in metres."""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Tiles of a mosaic at full resolution: every pixel from the scene that its cell has."""
+"""Tiles of a mosaic at full resolution: each pixel comes from the scene of its cell."""
 
 import math
 from collections.abc import Sequence

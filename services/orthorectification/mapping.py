@@ -1,4 +1,4 @@
-"""Positions in an image of the pixels of a map, through the model of the image and the terrain.
+"""Image positions of the pixels of a map, through the model of the image and the terrain.
 
 The model projects nodes of the map at three heights. Positions are bilinear between the nodes and
 quadratic between the heights; the height is that of the terrain at each pixel. So the relief is

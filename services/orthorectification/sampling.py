@@ -1,4 +1,4 @@
-"""Values of an image at any positions, for a window of another image at a time."""
+"""Interpolation of an image at given positions, one window of the result at a time."""
 
 import numpy as np
 from numba import njit

@@ -1,4 +1,4 @@
-"""An image without what no RPC follows: jitter, bends, lost lines and detectors out of place.
+"""Straightened images: resampled without jitter, bends, lost lines and displaced detectors.
 
 A registration follows the motion of lines and samples by a displacement on a grid. No RPC carries that,
 and few programs read it. Resampled by the displacement alone, the image has the delivered model with an

@@ -1,4 +1,4 @@
-"""Images, sites and points of a block that does not exist yet."""
+"""Planned images, sites and points of a block that does not exist yet."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

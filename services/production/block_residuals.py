@@ -1,5 +1,4 @@
-"""Fit of images and points in the adjustment of their block: residuals, corrections, conspicuous
-images."""
+"""Residuals and corrections of images and points in their block, and images that do not fit."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Control of all kinds, which places a block on the Earth."""
+"""Control of all kinds, which determines the position of a block on the Earth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Control from older blocks: their points, found by their chips in the images of a new block."""
+"""Control from older blocks: their points, matched by chips in the images of a new block."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""What a production costs, before it is made: core-hours, memory and bytes, from measured rates."""
+"""Predicted cost of a production: core-hours, memory and bytes, from measured rates."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

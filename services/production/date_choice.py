@@ -1,4 +1,4 @@
-"""Choice of the dates of a base: clear ones, over seasons and orbits, until all ground is seen often."""
+"""Selection of the dates of a base: clear, over seasons and orbits, until all ground is seen."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence

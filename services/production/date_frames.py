@@ -1,4 +1,4 @@
-"""Where dates of ortho-images lie on the Earth, from their shifts against each other."""
+"""Position of each date of ortho-images on the Earth, from the shifts between dates."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Control points at places known in advance: their saliency, their views in images that agree."""
+"""Control points at given places: their saliency, and their views in images that agree."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Cells of the ground of nearly equal area, and those that lie in footprints.
+"""Ground cells of nearly equal area, and the cells inside footprints.
 
 The grid is the integerized sinusoidal grid of SeaWiFS and MODIS level 3 data: rows of equal latitude,
 each cut into the whole number of cells that makes them closest to squares. It has neither seam nor pole:

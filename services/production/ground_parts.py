@@ -1,4 +1,4 @@
-"""Points of a block, by parts of the ground: measured and cut out with the images that show the part."""
+"""Points of a block, measured and cut out in parts of the ground with the images that show them."""
 
 import itertools
 from collections.abc import Callable, Sequence

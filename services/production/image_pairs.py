@@ -1,4 +1,4 @@
-"""Which pairs of images to match: from their ground and their directions, not all with all."""
+"""Selection of image pairs to match, by their common ground and viewing directions."""
 
 from collections.abc import Sequence
 

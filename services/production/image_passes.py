@@ -1,4 +1,4 @@
-"""Which images of a block may come from one pass of a satellite, and so share their errors."""
+"""Images of a block that may come from one pass of a satellite, and so have common errors."""
 
 from collections.abc import Sequence
 from datetime import timedelta

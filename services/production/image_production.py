@@ -1,4 +1,4 @@
-"""BLOCK OF IMAGES IN -> NEW POINTS OUT: tie, adjust, measure on chips, select, cut."""
+"""Production of points from a block of images: tie, adjust, measure on chips, select, cut."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence

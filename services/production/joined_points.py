@@ -1,4 +1,4 @@
-"""Points of several tiles of ortho-images as those of one block, in one frame."""
+"""Points of several tiles of ortho-images, joined to one block in one frame."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""BLOCK AND REGISTERED SCENES IN -> NEW POINTS OUT, where the density of the block is short."""
+"""New points of a block from registered scenes, where the density of the block is too low."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

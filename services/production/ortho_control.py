@@ -1,4 +1,4 @@
-"""Control from ortho-images: where details of the images lie on them, east and north."""
+"""Control from ortho-images: horizontal positions of image details in the ortho-images."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""ORTHO-IMAGES AND HEIGHTS IN -> NEW POINTS OUT: the salient corners of images that lie on a map."""
+"""Production of points from ortho-images and heights: the salient corners of the images."""
 
 import math
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""An adjusted block on control that came later: found in its images, and the block moved onto it."""
+"""Later control for an adjusted block: matched in its images, and the block shifted onto it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

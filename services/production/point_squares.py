@@ -1,4 +1,4 @@
-"""Squares of the ground of which each gets one point, and tie points looked for in them."""
+"""Ground squares that need one point each, and the search for tie points in them."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The surface at points of a block: pairs of its images, matched densely around each point."""
+"""Surface heights at the points of a block: dense matching of image pairs around each point."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""The views of produced points: which images show them, and their chips."""
+"""The views of produced points: the images that show them, and their chips."""
 
 from collections.abc import Callable, Sequence
 

@@ -1,4 +1,4 @@
-"""POINTS OF ANOTHER BASE AND IMAGES IN -> POINTS WITH CHIPS OUT: known ground, cut from images."""
+"""Production of chips for the points of another base, cut from images at known ground."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence

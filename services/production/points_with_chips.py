@@ -1,4 +1,4 @@
-"""POINTS OF ANOTHER BASE WITH CHIPS OF THEIR OWN IN -> POINTS OF A BLOCK OUT, without any image."""
+"""Conversion of the points of another base, with their own chips, to points of a block."""
 
 import math
 from collections.abc import Callable, Iterator

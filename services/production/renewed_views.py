@@ -1,4 +1,4 @@
-"""POINTS AND REGISTERED SCENES IN -> THE SAME POINTS WITH NEW VIEWS: positions stay, chips are added.
+"""New views of the points of a block from registered scenes; positions do not change.
 
 New points of the same scenes join them at the end.
 """

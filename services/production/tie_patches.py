@@ -1,4 +1,4 @@
-"""Where large images are searched for tie points: squares of the ground that they have in common."""
+"""Ground squares, common to all images, in which large images are searched for tie points."""
 
 from collections.abc import Sequence
 

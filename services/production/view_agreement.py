@@ -1,4 +1,4 @@
-"""Several images of the same ground: brought onto one of them, with the views of points that agree."""
+"""Alignment of several images of the same ground, and the views of points that agree."""
 
 import math
 from collections.abc import Callable, Sequence

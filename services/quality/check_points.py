@@ -1,4 +1,4 @@
-"""Independent check points: the errors of a registered model at ground that had no part in it."""
+"""Independent check points: errors of a registered model at ground that it was not fitted to."""
 
 from dataclasses import dataclass, replace
 

@@ -1,4 +1,4 @@
-"""Leave-out series: errors of known ground by the number of control points, the images and their base.
+"""Leave-out series: errors at known ground by number of control points, images and their base.
 
 The configurations are those of Toutin and Carbonneau (1992, Multi-stereoscopy for the correction of
 SPOT-HRV images): one image with known heights, pairs, and all images, on more and more control points.

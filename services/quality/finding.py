@@ -1,4 +1,4 @@
-"""A finding: something that the correction of a scene does not follow, and the harm that it leaves."""
+"""A finding: an error that the correction of a scene does not contain, and its harm."""
 
 from dataclasses import dataclass
 

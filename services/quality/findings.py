@@ -1,4 +1,4 @@
-"""What the correction of a scene does not follow: each finding with the harm that it leaves.
+"""All findings of a scene: errors that its correction does not contain, each with its harm.
 
 A finding has no limit of its own. What it leaves in the delivered image, one standard deviation of a
 position, enters the accuracy that is stated for every place; what makes a part of the image unknown

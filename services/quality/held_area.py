@@ -1,4 +1,4 @@
-"""The part of an image that its points hold: where its accuracy is known, and stated.
+"""The area of an image that its points hold, for which accuracy is known and stated.
 
 A correction is checked where points agree with it. Elsewhere it is an extrapolation, and what a scanner
 did there (lines lost, an attitude that jumped) nobody saw. A place is held by an agreeing point within

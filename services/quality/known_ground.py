@@ -1,4 +1,4 @@
-"""Intersected points compared with known ground, and the parallaxes that their marks leave."""
+"""Comparison of intersected points with known ground, and residual parallaxes of their marks."""
 
 from dataclasses import dataclass
 

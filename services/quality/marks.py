@@ -1,4 +1,4 @@
-"""What a registration on marks says of each mark, and where one more mark would help most."""
+"""Results for each mark of a registration, and the best place for one more mark."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""CE90 and LE90 of the normal law, without the statistics of samples and what these load."""
+"""CE90 and LE90 of a normal distribution, without the imports of sample statistics."""
 
 from collections.abc import Callable
 from functools import lru_cache

@@ -1,4 +1,4 @@
-"""Planimetric quality of a block: CE90 by site, check-only sites apart, declared against found."""
+"""Planimetric quality of a block: CE90 by site and kind of site, declared and measured."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Points that agree with each other on another displacement than the rest of the scene."""
+"""Points that agree with each other on a displacement that the rest of the scene does not have."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""How good a registration is: figures first, then a verdict that follows from thresholds alone."""
+"""Quality of a registration: figures, and a verdict that follows from thresholds alone."""
 
 from dataclasses import dataclass, replace
 

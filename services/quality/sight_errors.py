@@ -1,4 +1,4 @@
-"""Errors of the line of sight: heights displace points by another amount than in the model.
+"""Errors of the line of sight: displacements that grow with height, unlike in the model.
 
 A model that belongs to another view, and points whose heights have another datum or scale, displace a
 place by its height above the surface that the correction follows, times a slope. Three things show that

@@ -1,4 +1,4 @@
-"""Planimetric errors of a block at sites of which there are precise ortho-images."""
+"""Planimetric errors of a block at sites with precise ortho-images."""
 
 import math
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Planimetric errors of the images of a block at sites: laid over the terrain, and compared there."""
+"""Planimetric errors of the images of a block at sites, measured in the geometry of each image."""
 
 import math
 from collections.abc import Sequence

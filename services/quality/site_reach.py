@@ -1,4 +1,4 @@
-"""How far one known site carries: each alone as control of a block, the others as check."""
+"""Reach of a known site: each site alone as control of a block, the others as check."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

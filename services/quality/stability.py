@@ -1,4 +1,4 @@
-"""How stable a correction is: repeated with fewer points."""
+"""Stability of a correction: the adjustment repeated with fewer points."""
 
 import math
 from collections.abc import Callable, Sequence

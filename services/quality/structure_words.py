@@ -1,4 +1,4 @@
-"""Sentences on what structures of residuals look like, and what may cause them."""
+"""Sentences that describe structures of residuals and their possible causes."""
 
 import numpy as np
 

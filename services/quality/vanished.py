@@ -1,4 +1,4 @@
-"""Points that have vanished: later scenes search them again and again and find their neighbours only."""
+"""Points that have vanished: later scenes show their neighbours, but not the points."""
 
 from dataclasses import dataclass
 

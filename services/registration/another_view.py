@@ -1,4 +1,4 @@
-"""Whether a refused first search shows that the model belongs to another view."""
+"""Test whether a refused first search shows a model of another view."""
 
 import numpy as np
 

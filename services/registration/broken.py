@@ -1,4 +1,4 @@
-"""The refusal of a scene whose image has lost or repeated lines names these lines."""
+"""Refusal of a scene with lost or repeated lines, which names these lines."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,4 +1,4 @@
-"""The coarse search of a scene whose model may be far off: few points, far out, and a consensus.
+"""Coarse search of a scene with a large model error: few points, a wide search, a consensus.
 
 Few large chips fit into a scene side by side, those that overlap say little more than one, and clouds
 hide each with all its ground. Where they agree no better than by chance, more points are searched with

@@ -1,4 +1,4 @@
-"""Points that were not found where the registered model expects them, searched again in a wide window.
+"""Second search, in a wide window, of points that were not found at their expected positions.
 
 The last search is narrow. A part of a scene that lies elsewhere (lines that were lost or repeated,
 ground that moved) is beyond it: its points count as not found, and nothing else speaks of them.

@@ -1,4 +1,4 @@
-"""The search of a scene that may be kilometres off: small chips in a map of the scene, and one shift."""
+"""Search of a scene displaced by kilometres: small chips in a map of the scene, and one shift."""
 
 import math
 from collections import Counter

@@ -1,4 +1,4 @@
-"""Lines and samples whose points were missed, searched again farther out.
+"""Second, wider search of points on lines and samples where points were not found.
 
 The last search reaches a few pixels. Where lines were lost or repeated, or the sensor oscillates by
 more, all points of some lines lie beyond it, while points of other lines are found. The same happens to

@@ -1,4 +1,4 @@
-"""SCENE AND MARKED GROUND IN -> REGISTERED MODEL OUT: what a person marked, without any search."""
+"""Registration of a scene on ground points that a person marked, without any search."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""SCENE IN -> REGISTERED MODEL OUT: predict, match, adjust, qualify. Start reading here."""
+"""Registration of a scene on points: predict, match, adjust, qualify. Start reading here."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

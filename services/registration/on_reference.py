@@ -1,4 +1,4 @@
-"""SCENE AND REFERENCE IMAGE IN -> REGISTERED MODEL OUT, without control points."""
+"""Registration of a scene on a reference image, without control points."""
 
 from dataclasses import dataclass, replace
 from functools import partial

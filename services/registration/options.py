@@ -1,4 +1,4 @@
-"""Options of a registration: the same object is the body of a request and the record in the report."""
+"""Options of a registration: body of a request, and record in the report."""
 
 from dataclasses import dataclass, field
 

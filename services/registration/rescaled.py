@@ -1,4 +1,4 @@
-"""An image with finer or coarser pixels than its model says: a model of another image of the product.
+"""Images with finer or coarser pixels than their model: the model is of another image.
 
 The model of a panchromatic image beside a colour image, or a delivered model beside an image that was
 resampled, place the first pixel right and all others farther off, the farther they lie from it. No shift

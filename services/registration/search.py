@@ -1,4 +1,4 @@
-"""One search of points through one model, and the adjustment on what it found: used by all stages."""
+"""One search of points with one model, and the adjustment on its result; used by all stages."""
 
 import math
 from collections import Counter

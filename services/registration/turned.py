@@ -1,4 +1,4 @@
-"""Models of an image that was turned, a common reason why a scene is not found."""
+"""Models for rotated or mirrored images, a common reason why a scene is not found."""
 
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The report on a base as a page: its points on the map, and where its dates lie."""
+"""The report on a base as a page: its points on the map, and the frames of its dates."""
 
 import numpy as np
 

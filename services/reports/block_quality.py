@@ -1,4 +1,4 @@
-"""The report on the quality of a block: one tree of dataclasses, as that of a registration."""
+"""Content of the report on the quality of a block: one tree of dataclasses."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""The report of a registration, made from the registration and the facts around it."""
+"""Construction of the report of a registration, from its result and the surrounding facts."""
 
 import math
 from collections.abc import Sequence

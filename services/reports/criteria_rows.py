@@ -1,4 +1,4 @@
-"""The criteria of a report, each once: its value, its limits and the level that it reaches."""
+"""Criteria of a report, one row for each: value, limits, and the level that is reached."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

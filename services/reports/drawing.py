@@ -1,4 +1,4 @@
-"""What the figures of a report share: palette, sizes of marks, and the scene under the marks."""
+"""Common parts of the figures of a report: palette, mark sizes, and the scene as background."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""What the figures of a report draw beside its numbers: points, a quicklook, chips beside the scene."""
+"""Data of the figures of a report: points, a quicklook, chips next to the scene."""
 
 import math
 from dataclasses import dataclass

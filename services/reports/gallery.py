@@ -1,4 +1,4 @@
-"""Chips beside the scene before and after its registration, as images inside a page."""
+"""Chips next to the scene before and after its registration, as images inside a page."""
 
 import base64
 from dataclasses import dataclass

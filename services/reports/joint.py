@@ -1,4 +1,4 @@
-"""The report of scenes registered together: all of them side by side, and those that did not fit."""
+"""The report of a joint registration: all scenes side by side, and those that did not fit."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Numbers as text for people."""
+"""Formatting of numbers for people."""
 
 from amers.services.quality.accuracy import Quantile
 from amers.services.quality.block_requirements import BlockCriterion

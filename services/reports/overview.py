@@ -1,4 +1,4 @@
-"""One page over the reports of many scenes that were registered one by one."""
+"""One page that summarises the reports of many scenes, registered one by one."""
 
 from collections import Counter
 from collections.abc import Sequence

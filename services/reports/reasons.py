@@ -1,4 +1,4 @@
-"""Why points are not active: the codes of matching and adjustment, counted and explained."""
+"""Reasons why points are not active: codes of matching and adjustment, counted and explained."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -1,4 +1,4 @@
-"""What reports say of a scene and of its registration, in words."""
+"""Sentences of reports about a scene and its registration."""
 
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass

@@ -1,4 +1,4 @@
-"""What hold-outs show, in words: the same in every report."""
+"""Sentences about the results of hold-outs, the same in every report."""
 
 from amers.services.quality.cell_stability import CellStability
 from amers.services.quality.stability import GroupMeans, Stability

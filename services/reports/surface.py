@@ -1,4 +1,4 @@
-"""Content of the reports on a surface and on the difference of two: what was made of what."""
+"""Content of the reports on a surface and on a difference of two: inputs, options, figures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

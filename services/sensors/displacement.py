@@ -1,4 +1,4 @@
-"""A displacement of image positions that no affine correction follows, on a grid of nodes."""
+"""A displacement of image positions that is not affine, on a grid of nodes."""
 
 from dataclasses import dataclass, field
 

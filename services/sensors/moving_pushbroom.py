@@ -1,4 +1,4 @@
-"""A rigorous model whose lines and samples move: attitude over time, look directions of detectors.
+"""Rigorous models with displaced lines and samples: attitude over time, look directions.
 
 A scanner that shakes displaces whole lines, and optics that are bent displace columns. In the image both
 are a displacement; in a rigorous model the first is a turn of the satellite while it scans, the second

@@ -1,4 +1,4 @@
-"""The sensor model of an ortho-image: a map grid, with the parallax that its terrain has left."""
+"""The sensor model of an ortho-image: a map grid, with parallax from errors of its terrain."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

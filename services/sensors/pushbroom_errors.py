@@ -1,4 +1,4 @@
-"""Errors of a rigorous model in attitude, orbit and focal length, and the model without them."""
+"""Errors of a rigorous model in attitude, orbit and focal length, and the corrected model."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -1,4 +1,4 @@
-"""The RPC of a refined model, exact or fitted, where one is close enough."""
+"""The RPC of a refined model, exact or fitted, if an RPC is close enough."""
 
 import math
 from dataclasses import dataclass

@@ -1,1 +1,1 @@
-"""Ground truth that can be photographed: simulated worlds, satellites and images."""
+"""Simulated worlds, satellites and images with exactly known ground truth."""

@@ -1,4 +1,4 @@
-"""An archive of images of a simulated world: passes over years, clouds, seasons, errors of the models.
+"""An archive of simulated images: passes over years, clouds, seasons, errors of the models.
 
 Everything follows from the seed of the archive: each image draws from seeds of its own.
 """

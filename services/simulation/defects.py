@@ -1,4 +1,4 @@
-"""Pixels as in archives: quantised, some missing, some brighter than the sensor can measure."""
+"""Pixel defects as in archives: quantised, missing and saturated pixels."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Detectors that lie elsewhere than in the sensor model, and that blur the image."""
+"""Detectors at other positions than in the sensor model, and blur of the image."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Distortions without a sensor model: jitter, bows, lost lines, seams, moved ground, swapped axes."""
+"""Distortions without a sensor model: jitter, bows, lost lines, seams, displaced ground."""
 
 from collections import OrderedDict
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Images of a world that are rendered where they are read, for scenes too large to render whole."""
+"""Images of a world, rendered in tiles on request, for scenes too large to render whole."""
 
 import math
 from collections import OrderedDict

@@ -1,1 +1,1 @@
-"""Surfaces: heights of the ground and of what stands on it, from overlapping registered images."""
+"""Surfaces: heights of the ground and the objects on it, from overlapping registered images."""

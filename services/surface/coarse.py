@@ -1,4 +1,4 @@
-"""A search with coarse pixels: which pairs agree, and between which heights the surface lies."""
+"""Search with coarse pixels: the pairs that agree, and the height range of the surface."""
 
 import math
 import warnings

@@ -1,4 +1,4 @@
-"""What changed between two surfaces: the later one is moved onto the earlier one, and compared.
+"""Difference of two surfaces: the later one is aligned with the earlier one and compared.
 
 Source of the alignment: Nuth and Kääb (2011), Co-registration and bias corrections of satellite
 elevation data sets for quantifying glacier thickness change; here by weighted least squares. Of its

@@ -1,4 +1,4 @@
-"""Gaps of a surface filled from the heights around them.
+"""Filling of the gaps of a surface from the surrounding heights.
 
 Source of the rule: Hirschmüller (2008), Stereo processing by semiglobal matching and mutual information:
 what is hidden lies behind what hides it, so that of the heights in eight directions the second lowest is

@@ -1,4 +1,4 @@
-"""Surfaces of several pairs made one: each pair aligned to their median, heights weighted, with a sigma.
+"""Fusion of the surfaces of several pairs: aligned to their median, weighted, with a sigma.
 
 Pairs of one block disagree by decimetres to metres, the more the shorter their base, by errors of their
 models along the rows. Each pair is therefore shifted onto the median of all. Source of the shift in

@@ -1,4 +1,4 @@
-"""Dense matching of rectified images: the interface of matchers, and the one that is used by default."""
+"""Dense matching of rectified images: the interface of matchers, and the default matcher."""
 
 from dataclasses import dataclass
 from enum import IntEnum

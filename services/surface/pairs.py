@@ -1,4 +1,4 @@
-"""Pairs of images from which a surface is made: by angle, by the time between them, by overlap."""
+"""Selection of image pairs for a surface: by angle, by the time between them, by overlap."""
 
 import math
 from collections import Counter

@@ -1,4 +1,4 @@
-"""Pairs of images resampled so that the same ground lies on the same row: affine epipolar rectification.
+"""Affine epipolar rectification: image pairs resampled so that the same ground is on one row.
 
 Over a tile of some thousand pixels the rows of two pushbroom images differ from those of affine cameras
 by some thousandths of a pixel, so that one affine map an image is enough. Source: de Franchis and others

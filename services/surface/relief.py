@@ -1,4 +1,4 @@
-"""How heights look: colours of values, and heights in colours under a light from the north-west.
+"""Rendering of heights: colours of values, and shading with a light from the north-west.
 
 Source: Horn (1981), Hill shading and the reflectance map: a surface that reflects the same to all sides.
 """

@@ -1,4 +1,4 @@
-"""A surface from overlapping scenes: pairs of images chosen, matched tile by tile, aligned and fused."""
+"""A surface from overlapping scenes: pairs selected, matched in tiles, aligned and fused."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace

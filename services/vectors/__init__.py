@@ -1,1 +1,1 @@
-"""Vectors digitised on a raw scene, brought onto the map, and map vectors brought into the scene."""
+"""Vectors digitised on a raw scene and moved to the map, and map vectors moved to the scene."""

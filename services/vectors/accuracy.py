@@ -1,4 +1,4 @@
-"""Predicted accuracy of ground that a model and a terrain give, vertex by vertex."""
+"""Predicted accuracy of ground positions from a model and a terrain, vertex by vertex."""
 
 from dataclasses import dataclass
 

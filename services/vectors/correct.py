@@ -1,4 +1,4 @@
-"""Vectors digitised on a raw image, brought onto the map through its model and a terrain."""
+"""Map positions of vectors digitised on a raw image, through its model and a terrain."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Curved edges: vertices between those of shapes where a straight edge bends under a transformation.
+"""Curved edges: vertices that are added where a transformation bends a straight edge.
 
 An edge is transformed at places between its ends, at more of them where it bends, and as few of these
 become vertices as keep within the tolerance (Douglas and Peucker 1973). Edges that two geometries

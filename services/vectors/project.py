@@ -1,4 +1,4 @@
-"""Vectors of a map, brought into a raw image through its model and a terrain."""
+"""Image positions of vectors of a map, through the model of a raw image and a terrain."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""The metadata of an Amers block as typed data: the content of `block.json`, free of JSON."""
+"""Metadata of an Amers block as typed data: the content of `block.json`, independent of JSON."""
 
 import re
 from collections.abc import Mapping

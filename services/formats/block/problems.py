@@ -1,4 +1,4 @@
-"""The problems of a block: the first ones in full, all of them counted."""
+"""Problems found in a block: the first ones in full, and the number of all."""
 
 from dataclasses import dataclass, field
 from typing import Any

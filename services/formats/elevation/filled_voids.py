@@ -1,4 +1,4 @@
-"""Voids of heights filled from the heights around them."""
+"""Voids of a terrain, filled from the surrounding heights."""
 
 from dataclasses import dataclass
 

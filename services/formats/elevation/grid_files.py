@@ -1,4 +1,4 @@
-"""Files of heights: images as for scenes, and the grids and VRTs that operators have on disk.
+"""Files of heights: images as for scenes, and grids and VRTs from the disk of the operator.
 
 | kind | driver of GDAL | files beside it |
 |---|---|---|

@@ -1,4 +1,4 @@
-"""Heights of files: their unit and their datum, for terrains and for points alike.
+"""Unit and vertical datum of heights in files, for terrains and for points.
 
 "Above the ellipsoid" means what GNSS receivers give: above the ellipsoid of WGS 84. A caller, or a file
 whose reference system has no heights, that states it in a national horizontal system does not mean the

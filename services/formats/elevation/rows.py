@@ -1,4 +1,4 @@
-"""What the readers of terrains, geoids and map grids do with each statement in their files."""
+"""Treatment of the statements in files of terrains, geoids and map grids."""
 
 from amers.services.formats.reader_rows import Reader, Treatment
 from amers.services.statements import Subject

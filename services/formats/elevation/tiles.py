@@ -1,4 +1,4 @@
-"""One file of heights: its map grid, its heights in metres, and what it states."""
+"""One file of heights: its map grid, its heights in metres, and its statements."""
 
 from dataclasses import dataclass, replace
 

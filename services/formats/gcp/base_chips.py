@@ -1,4 +1,4 @@
-"""Chips of the points of other bases, each as a small ortho-image: GCPLib and the Copernicus database.
+"""Chips of points from GCPLib and the Copernicus database, each read as a small ortho-image.
 
 Their layouts are those of public software that writes or reads them; no delivered chip was available.
 """

@@ -1,4 +1,4 @@
-"""What comments of point files state: reference system, datum of the heights, unit, epoch."""
+"""Statements in comments of point files: reference system, vertical datum, unit, epoch."""
 
 import re
 from collections.abc import Iterable, Iterator

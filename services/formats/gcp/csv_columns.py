@@ -1,4 +1,4 @@
-"""Heads of the columns of point tables: which value a column has, in which unit, above which datum."""
+"""Column names of point tables: the value, the unit and the vertical datum of each column."""
 
 import re
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Ground points in CSV files, whose columns have the names below or are mapped to them by the caller."""
+"""Ground points in CSV files with the column names below, or with names mapped by the caller."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""Columns of CSV files that are not read: named, or refused where they would change the result."""
+"""Unused columns of CSV files: reported, or refused if they would change the result."""
 
 import re
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Lines of CSV files: comments, the names of the columns, and rows, in the dialects of spreadsheets."""
+"""Lines of CSV files in the dialects of spreadsheets: comments, column names and rows."""
 
 import csv
 import io

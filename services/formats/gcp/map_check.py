@@ -1,4 +1,4 @@
-"""Positions that a file states twice, in degrees and on a map: both must be the same place."""
+"""Check of positions that a file states twice, in degrees and on a map."""
 
 import math
 

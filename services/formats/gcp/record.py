@@ -1,4 +1,4 @@
-"""The record of the statements of one file while it is read."""
+"""Record of the statements of one file, filled while the file is read."""
 
 from dataclasses import dataclass, field, replace
 

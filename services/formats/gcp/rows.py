@@ -1,4 +1,4 @@
-"""What the readers of files of points do with each statement in them."""
+"""Treatment of the statements in files of points."""
 
 from amers.services.formats.reader_rows import Reader, Treatment
 from amers.services.statements import Subject

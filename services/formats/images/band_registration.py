@@ -1,4 +1,4 @@
-"""Whether the bands of a mix lie on each other: measured before a panchromatic value is made of them.
+"""Displacement between the bands of an image, measured before they are mixed to one value.
 
 Bands of one product that lie apart give a mean that is blurred and lies between them, without a trace in
 the residuals of a registration.

@@ -1,4 +1,4 @@
-"""The bands of an image that are used, their weights in one mixed band, and codes among their pixels."""
+"""Selection of bands, their weights in one mixed band, and special codes of their pixels."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""Datasets of GDAL: the driver that the first bytes name, the file alone, errors that name the file."""
+"""GDAL datasets: opened by the driver of their first bytes, with errors that name the file."""
 
 import atexit
 import threading

@@ -1,4 +1,4 @@
-"""Keys of GeoTIFF that the library does not pass on. Sources: OGC GeoTIFF 1.1, GDAL RFC 81."""
+"""GeoTIFF keys that the reading library ignores. Sources: OGC GeoTIFF 1.1, GDAL RFC 81."""
 
 import struct
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Where an image is on a map: its own geotransform, `.aux.xml`, and the world file with its `.prj`.
+"""Map position of an image: its own geotransform, `.aux.xml`, or a world file with its `.prj`.
 
 GDAL's order: `.aux.xml`, the image itself, the world file. GDAL does not read a `.prj` beside an image;
 other programs do, and it is used where nothing else states the reference system.

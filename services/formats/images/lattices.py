@@ -1,4 +1,4 @@
-"""The common grid of many files on maps: that of one of them, extended to all."""
+"""Common grid of many files on maps: the grid of one of them, extended over all."""
 
 from dataclasses import dataclass, replace
 

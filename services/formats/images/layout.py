@@ -1,4 +1,4 @@
-"""How the pixels of a TIFF are packed: what has to be unpacked to read one of them. Source: TIFF 6.0.
+"""Layout of the pixels in a TIFF: the data to decompress for one pixel. Source: TIFF 6.0.
 
 GDAL shows a compressed strip that is a whole image as strips of one line, and unpacks it from its begin
 for each of them. Only the directories of the file tell.

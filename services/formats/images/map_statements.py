@@ -1,4 +1,4 @@
-"""What a file on a map states of its map grid."""
+"""Statements of a file about its map grid."""
 
 from dataclasses import replace
 from pathlib import Path

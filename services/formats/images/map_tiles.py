@@ -1,4 +1,4 @@
-"""Tiles of a scene on the map in one file, of which each tile is found and read by its position.
+"""Map tiles of a scene in one file, in which each tile is read by its position.
 
 The file begins with a record for every tile of every zoom, the finest first, row by row: its position in
 the file (8 bytes) and its size (4 bytes), least significant byte first. The tiles follow. One that the

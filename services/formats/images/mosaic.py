@@ -1,4 +1,4 @@
-"""Many ortho-images as one, read by windows; few of them are open at a time."""
+"""Many ortho-images as one, read by windows with few files open at a time."""
 
 from collections import OrderedDict
 from dataclasses import dataclass, field

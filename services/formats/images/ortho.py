@@ -1,4 +1,4 @@
-"""Writing images that were resampled, on a map or straightened, and corrected map grids."""
+"""Writing resampled images (on a map or straightened) and corrected map grids."""
 
 import shutil
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""What becomes of the statements of image files about their pixels, and of those of masks."""
+"""Treatment of the statements of image files and masks about their pixels."""
 
 from amers.services.formats.reader_rows import Reader, Treatment
 from amers.services.statements import Subject

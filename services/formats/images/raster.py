@@ -1,4 +1,4 @@
-"""Untrusted image files: few drivers, few files beside, bounded sizes; at a path only a local file."""
+"""Opening untrusted image files: few drivers, few side files, limited sizes, local paths only."""
 
 import shutil
 import warnings

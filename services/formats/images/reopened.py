@@ -1,4 +1,4 @@
-"""Bands of images that are open only while they are read, since a mosaic has hundreds of images."""
+"""Bands that open their file only while they are read, for mosaics of hundreds of images."""
 
 import pickle
 import threading

@@ -1,4 +1,4 @@
-"""The files beside an image, by their names in upper or lower case."""
+"""Files next to an image, found by name in upper or lower case."""
 
 import os
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Kinds of image files by their first bytes, known without the library that reads them."""
+"""Recognition of image formats by their first bytes, without the library that reads them."""
 
 DRIVER_OF_SIGNATURE = {
     b"II*\0": "GTiff",

@@ -1,4 +1,4 @@
-"""Surfaces on the map of the web: tiles in colours under a light, rendered from the file on demand."""
+"""Web map tiles of surfaces: coloured and shaded heights, rendered from the file on request."""
 
 import cv2
 import numpy as np

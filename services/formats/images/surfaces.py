@@ -1,4 +1,4 @@
-"""Files of surfaces: their bands, their reference system, and how they are read by windows."""
+"""Files of surfaces: bands, reference system, and reading by windows."""
 
 from contextlib import ExitStack
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""An image that is delivered in several files: its tiles are read by windows, as one image."""
+"""An image that is delivered in several files, read by windows as one image."""
 
 from dataclasses import dataclass, replace
 

@@ -1,4 +1,4 @@
-"""A raw image as tiles for a viewer: grey values at falling resolutions, one after another in a file."""
+"""Tiles of a raw image for a viewer: grey values at decreasing resolutions, in one file."""
 
 import json
 from dataclasses import asdict, dataclass

@@ -1,4 +1,4 @@
-"""Which pixels of an image file have no data: masks, alpha bands and nodata values, as GDAL takes them.
+"""Pixels without data in an image file: masks, alpha bands and nodata values, as in GDAL.
 
 The first of these decides, the others are named: a mask inside the file, a mask beside it (`NAME.msk`),
 an alpha band, a nodata value. GDAL looks for an alpha band among two or four bands only, and for nodata

@@ -1,4 +1,4 @@
-"""Local copies of the parts of large images that are needed, without what a mask hides."""
+"""Local copies of the needed parts of large images, without the pixels that a mask excludes."""
 
 import math
 import uuid

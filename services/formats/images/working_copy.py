@@ -1,4 +1,4 @@
-"""Images whose pixels cannot be read by windows: unpacked once, into a working copy in small tiles."""
+"""Working copies, in small tiles, of images that cannot be read by windows."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""The turns of a satellite over time, as a table."""
+"""Table of the attitude changes of a satellite over time (CSV)."""
 
 import csv
 import io

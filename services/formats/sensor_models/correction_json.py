@@ -1,4 +1,4 @@
-"""The correction of a sensor model as a JSON document, which every registration writes.
+"""The correction of a sensor model as a JSON document; every registration writes it.
 
 With `t = ((line, sample) - centre) / half_size`, a position of the delivered model moves by
 `parameters (1, t_line, t_sample)`, and by a displacement on a grid where there is one: bilinear between

@@ -1,4 +1,4 @@
-"""OSSIM keyword lists with an RPC (`.geom`), as OTB, CARS and shareloc have them.
+"""OSSIM keyword lists with an RPC (`.geom`), as written by OTB, CARS and shareloc.
 
 Pixels count from the centre of the first pixel at (0, 0); heights are above the ellipsoid. Coefficients
 are numbered from 00. Sources: `ossimRpcModel` (format, adjustments); the loaders of Pléiades and SPOT 6

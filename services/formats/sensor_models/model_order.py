@@ -1,4 +1,4 @@
-"""Which model of an image is used where it has several: GDAL's order, and how far the others differ.
+"""Choice of the model of an image that has several, in GDAL's order, and their differences.
 
 GDAL 3.10 takes, for a GeoTIFF, the files of vendors, then the RPC tag, then `.aux.xml`; for JPEG 2000
 `.aux.xml` first; for NITF `.aux.xml`, `_RPC.TXT` and RPC00B. Among files of vendors: `.RPB`, the XML of

@@ -1,4 +1,4 @@
-"""Where the pixels of an image file are in the full image, as its records and its product state it."""
+"""Position of the pixels of a file in the full image, from its records and its product."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Documents that say which files make one image: DIMAP (`DIM_….XML`, `METADATA.DIM`) and `.TIL`.
+"""Documents that list the files of one image: DIMAP (`DIM_….XML`, `METADATA.DIM`), `.TIL`.
 
 Sources: SPOT 6/7, Pléiades and Pléiades Neo product formats (Raster_Dimensions, Data_Access); Maxar,
 image support data (tile map file). A DIMAP tile of row R and column C begins at (R - 1, C - 1) times the

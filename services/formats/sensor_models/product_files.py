@@ -1,4 +1,4 @@
-"""The files of products in tiles: found by their documents, without opening any image."""
+"""Files of products in tiles, found by their documents without opening any image."""
 
 from pathlib import Path
 

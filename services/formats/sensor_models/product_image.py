@@ -1,4 +1,4 @@
-"""The image that a path stands for: an image file, a product in tiles by its document, or a folder."""
+"""The image that a path names: an image file, the document of a tiled product, or a folder."""
 
 from dataclasses import replace
 from pathlib import Path

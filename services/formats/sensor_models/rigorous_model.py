@@ -1,4 +1,4 @@
-"""The rigorous model of a product, whichever of the supported formats its metadata have."""
+"""The rigorous model of a product, from metadata in any supported format."""
 
 from collections.abc import Callable
 from pathlib import Path

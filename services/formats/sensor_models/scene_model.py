@@ -1,4 +1,4 @@
-"""The delivered model of a scene as a JSON document: what marks need of a scene, without its pixels."""
+"""The delivered model of a scene as a JSON document: enough to register marks without pixels."""
 
 import json
 from dataclasses import dataclass, fields

@@ -1,4 +1,4 @@
-"""Values of XML metadata: elements that must be there once, numbers, lists of numbers, times."""
+"""Values of XML metadata: required single elements, numbers, lists of numbers, times."""
 
 import re
 from datetime import datetime

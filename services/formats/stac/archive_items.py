@@ -1,4 +1,4 @@
-"""Items of archives of ortho-images: tile, orbit and processing baseline, under the names in use.
+"""STAC items of archives of ortho-images: tile, orbit and processing baseline.
 
 | fact | properties, the first that is stated |
 |---|---|

@@ -1,4 +1,4 @@
-"""One STAC item as the facts that a selection of images needs.
+"""The facts of one STAC item that a selection of images needs.
 
 Source: STAC 1.0 and 1.1 with the extensions eo, view and sat. Only geometry and time are required.
 

@@ -1,4 +1,4 @@
-"""Where the files of STAC items are."""
+"""Paths and addresses of the files of STAC items."""
 
 from pathlib import Path
 from urllib.parse import unquote, urlsplit

@@ -1,4 +1,4 @@
-"""Scenes of STAC items: their image files, with what the items state of them."""
+"""Scenes from STAC items: their image files, and the statements of the items."""
 
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Every item of a catalogue, one after the other: folders, files, links, pages of a search."""
+"""Iteration over all items of a catalogue: folders, files, links, pages of a search."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

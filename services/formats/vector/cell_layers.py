@@ -1,4 +1,4 @@
-"""Cells of the ground with numbers, as a layer of a GeoPackage."""
+"""A GeoPackage layer of ground cells with their figures."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Layers of vectors in files: read and written whole, with all attributes.
+"""Reading and writing of whole vector layers, with all attributes.
 
 | format | suffix | attributes |
 |---|---|---|

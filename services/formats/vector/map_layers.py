@@ -1,4 +1,4 @@
-"""Layers of vectors on a map, with their heights above the ellipsoid, and in pixels of an image."""
+"""Vector layers on a map with heights above the ellipsoid, and layers in pixels of an image."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Pixel coordinates in files of vectors, whose origin and signs depend on the tool that wrote them.
+"""Pixel coordinates in vector files; origin and signs depend on the tool that wrote them.
 
 | name | x | y | origin | written by |
 |---|---|---|---|---|

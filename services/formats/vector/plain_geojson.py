@@ -1,4 +1,4 @@
-"""GeoJSON that GDAL reads as GeoJSON, and as nothing else.
+"""Safe GeoJSON: a copy that GDAL cannot interpret as any other format.
 
 GDAL looks into a file for what it is. A JSON document may be a pipeline of commands that read other
 files, or hold a virtual dataset, and its reference system may be an address, which GDAL fetches. So GDAL
