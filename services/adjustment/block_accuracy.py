@@ -1,4 +1,4 @@
-"""Accuracy of an adjusted block: of its frame on the Earth, and of its points relative to that frame."""
+"""Accuracy of an adjusted block: its frame on the Earth, and its points relative to the frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

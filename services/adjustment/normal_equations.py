@@ -1,4 +1,4 @@
-"""The normal equations of a block, compiled: points are eliminated, images and their pairs remain."""
+"""Compiled normal equations of a block: points are eliminated; images and their pairs remain."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""The correction in the image that is nearest to an adjusted model, and the difference between both."""
+"""The image correction that is nearest to an adjusted model, and the difference between both."""
 
 from dataclasses import dataclass, replace
 

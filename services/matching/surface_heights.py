@@ -1,4 +1,4 @@
-"""The height of the surface at the centre of a chip, as distinct from that of its whole content."""
+"""Height of the surface at the centre of a chip, in contrast to the height of its content."""
 
 from collections.abc import Sequence
 

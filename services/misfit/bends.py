@@ -1,4 +1,4 @@
-"""Bends of an image that its points do not determine: a prior for the image beyond the points.
+"""Prior for bends of an image that its points do not determine, outside of the points.
 
 An image may be bent along its lines (attitude) or its samples (optics), and points on a part of it show
 little of that: a parabola whose ends are 1.5 px off is 0.1 px beside a straight line over three fifths

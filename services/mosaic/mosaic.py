@@ -1,4 +1,4 @@
-"""A mosaic of scenes: laid out on one map, levelled, cut along seams, steps measured, tiles made."""
+"""A mosaic of scenes: laid out on one map, levelled, cut along seams, with steps measured."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

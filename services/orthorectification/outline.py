@@ -1,4 +1,4 @@
-"""The edge of an image on the ground."""
+"""The outline of an image on the ground."""
 
 import numpy as np
 

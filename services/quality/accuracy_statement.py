@@ -1,4 +1,4 @@
-"""The statement of accuracy that every report, command, page and document makes, in the same words.
+"""The statement of accuracy, in the same words in every report, command, page and document.
 
 Two figures, in this order: relative to the control points, and on the Earth. The second includes the
 frame of the control points, an error that all of them share and that no registration on them can show.

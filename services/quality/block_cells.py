@@ -1,4 +1,4 @@
-"""Figures of a block in each cell of 0.1 degree: density, images per point, age, what is missing."""
+"""Figures of a block in each cell of 0.1 degree: density, images per point, age, missing points."""
 
 from dataclasses import dataclass
 from datetime import datetime

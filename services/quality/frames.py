@@ -1,4 +1,4 @@
-"""The frame of control points on the Earth: of several blocks together, and the effect of its error."""
+"""The frame of control points on the Earth: several blocks combined, and the effect of its error."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""The result of every point that a scene could show: position and residual, or why it has none."""
+"""Results of the points that a scene could show: position and residual, or a reason."""
 
 import numpy as np
 

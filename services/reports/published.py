@@ -1,4 +1,4 @@
-"""The tables published for scenes registered on SRP, with their columns and definitions.
+"""Published tables for scenes registered on SRP, with their columns and definitions.
 
 Source: Space Reference Points on Africa (2021): tables 2 and 4 (equipment, here: point counts), 3 and 5
 (residuals), 6 (displacement of corners and centre with 80 % of the points) and 7 (points held out).

@@ -1,4 +1,4 @@
-"""Simulated images with known geometry, and the erroneous models that a provider would deliver."""
+"""Simulated images with known geometry, and models with errors as a provider delivers them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Geometries as arrays of vertices without duplicates, and back."""
+"""Geometries as arrays of vertices without duplicates, and the conversion back."""
 
 from dataclasses import dataclass, replace
 

@@ -1,4 +1,4 @@
-"""The images of a STAC catalogue, with their masks, and the items themselves for later."""
+"""Images and masks of a STAC catalogue, with their items for later use."""
 
 import tempfile
 from collections.abc import Iterable, Iterator

@@ -1,4 +1,4 @@
-"""STAC items written as one item collection."""
+"""Writing STAC items as one item collection."""
 
 import json
 from collections.abc import Iterable
