@@ -7,20 +7,16 @@ and a mutant is tried again when its file has changed, or when it survived and t
 
 import argparse
 import json
-import re
-import subprocess
-import time
 from collections.abc import Sequence
-from hashlib import blake2b
 from pathlib import Path
 
 from mutants.changes import Mutant, mutants_of
 from mutants.covering import Coverage, digest, recorded_coverage
+from mutants.drawing import ROOT, changed_lines, commit, drawn, is_among
 from mutants.modules import Module, chosen_modules
 from mutants.report import Trial, equivalent_keys, survivors, table
-from mutants.trials import Workplace, copied_project
+from mutants.trials import copied_project, tried
 
-ROOT = Path(__file__).parent.parent
 KEPT = ROOT / ".mutants"
 TRIALS = KEPT / "trials.jsonl"
 
@@ -39,59 +35,30 @@ def main() -> None:
         help="of tests for each mutant, the fastest first (default: 60)",
     )
     parser.add_argument(
-        "--draw", default=_commit(), help="any text, which decides what is drawn (default: the commit)"
+        "--draw", default=commit(), help="any text, which decides what is drawn (default: the commit)"
     )
     parser.add_argument(
         "--since", metavar="COMMIT", help="only mutants of lines that were changed since a commit"
     )
     options = parser.parse_args()
-    changed = None if options.since is None else _changed_lines(options.since)
+    changed = None if options.since is None else changed_lines(options.since)
     print(f"drawn by {options.draw}", flush=True)
     trials: dict[str, Sequence[Trial]] = {}
     totals: dict[str, int] = {}
     for module in chosen_modules(options.module):
         with copied_project(ROOT) as copy:
             mutants = [one for path in module.mutated_files(copy) for one in mutants_of(copy, path)]
-            mutants = [one for one in mutants if changed is None or _is_among(one, changed)]
-            chosen = sorted(mutants, key=lambda one: _place(one, options.draw))[: options.sample]
+            mutants = [one for one in mutants if changed is None or is_among(one, changed)]
+            chosen = drawn(mutants, options.draw, options.sample)
             totals[module.name] = len(mutants)
-            trials[module.name] = _tried(copy, module, chosen, options.seconds)
+            trials[module.name] = _all_tried(copy, module, chosen, options.seconds)
         print(table(trials, totals), survivors(trials[module.name]), sep="\n\n", flush=True)
 
 
-def _place(mutant: Mutant, draw: str) -> str:
-    """Where a mutant stands in a draw."""
-    return blake2b(f"{draw}\0{mutant.key}".encode(), digest_size=8).hexdigest()
-
-
-def _commit() -> str:
-    return _git("rev-parse", "--short=8", "HEAD").strip()
-
-
-def _changed_lines(since: str) -> set[tuple[str, int]]:
-    """Files and lines of the working tree that a commit did not have."""
-    lines, path = set(), ""
-    for text in _git("diff", "--unified=0", since).splitlines():
-        if text.startswith("+++ "):
-            path = text.removeprefix("+++ b/")
-        elif place := re.match(r"@@ .* \+(\d+)(?:,(\d+))? @@", text):
-            first, count = int(place[1]), int(place[2] or 1)
-            lines |= {(path, line) for line in range(first, first + count)}
-    return lines
-
-
-def _is_among(mutant: Mutant, lines: set[tuple[str, int]]) -> bool:
-    return any((mutant.path, line) in lines for line in range(mutant.lines[0], mutant.lines[1] + 1))
-
-
-def _git(*words: str) -> str:
-    return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-
-
-def _tried(copy: Path, module: Module, mutants: Sequence[Mutant], limit_s: float) -> list[Trial]:
+def _all_tried(copy: Path, module: Module, mutants: Sequence[Mutant], limit_s: float) -> list[Trial]:
     """The trials of mutants, of which those that still hold are not repeated."""
     earlier, equivalent = {trial.key: trial for trial in _kept()}, equivalent_keys()
-    tests = digest(copy, module.test_files(copy))
+    tests = digest(copy, sorted(module.test_files(copy)))
     trials: list[Trial] = []
     coverage: Coverage | None = None
     for mutant in mutants:
@@ -99,41 +66,12 @@ def _tried(copy: Path, module: Module, mutants: Sequence[Mutant], limit_s: float
         trial = earlier.get(mutant.key)
         if trial is None or not (trial.holds(code, tests) or mutant.key in equivalent):
             coverage = coverage or recorded_coverage(copy, KEPT, module)
-            trial = _try(coverage, module, mutant, limit_s, (code, tests))
+            trial = tried(coverage, module.name, mutant, limit_s, digests=(code, tests))
             print(f"{trial.state:9} {mutant.path}:{mutant.lines[0]} {trial.seconds:.0f} s", flush=True)
             with TRIALS.open("a") as file:
                 file.write(json.dumps(trial.document()) + "\n")
         trials.append(trial)
     return trials
-
-
-def _try(
-    coverage: Coverage, module: Module, mutant: Mutant, limit_s: float, digests: tuple[str, str]
-) -> Trial:
-    covering = coverage.tests_of(mutant)
-    chosen, expected_s = list[str](), 0.0
-    for test in covering:
-        expected_s += coverage.seconds[test]
-        if chosen and expected_s > limit_s:
-            break
-        chosen.append(test)
-    begun = time.monotonic()
-    state = Workplace(coverage.root).outcome(mutant, chosen, min(expected_s, limit_s))
-    return Trial(
-        module=module.name,
-        key=mutant.key,
-        path=mutant.path,
-        line=mutant.lines[0],
-        definition=mutant.definition,
-        before=mutant.before,
-        after=mutant.after,
-        state=state,
-        tests=len(chosen),
-        covering=len(covering),
-        seconds=time.monotonic() - begun,
-        code=digests[0],
-        test_code=digests[1],
-    )
 
 
 def _kept() -> list[Trial]:

@@ -1,8 +1,8 @@
 """The mutants of a file: its text with one small change.
 
 The changes are those of mutmut, without what a type error shows at once (a value that becomes None, a
-missing argument) and without messages for people, and two more: a term, a factor or a condition is
-dropped, and the values of two arguments are exchanged.
+missing argument), what changes nothing, and messages for people; and two more: a term, a factor or a
+condition is dropped, and the values of two arguments are exchanged.
 """
 
 import itertools
@@ -27,8 +27,12 @@ _LEFT_ALONE = m.OneOf(
     m.Expr(m.SimpleString()),
     m.Expr(m.Call(m.Attribute(m.Name("log")))),
 )
-_OF_ANY_NUMBER = ("max", "min", "where", "and_", "or_")
+_OF_ANY_NUMBER = ("max", "min", "where", "and_", "or_", "greatest", "least")
 """Functions that do something else, and do not fail, with an argument less."""
+_SYMMETRIC = frozenset(_OF_ANY_NUMBER) - {"where"} | {"hypot", "maximum", "minimum", "intersects"}
+"""Functions to which the order of their arguments is nothing."""
+_FOR_READERS = ("strict", "type_")
+"""Named arguments that state what is true without them: equal lengths, the type of a term in SQL."""
 _COMMUTATIVE = (cst.Add, cst.Multiply, cst.BitAnd, cst.BitOr)
 
 
@@ -122,15 +126,24 @@ def _changes(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
 
 def _without_an_argument(call: cst.Call) -> Iterator[cst.CSTNode]:
     """A call without a named argument, or without one of any number."""
-    name = call.func.attr if isinstance(call.func, cst.Attribute) else call.func
-    of_any_number = isinstance(name, cst.Name) and name.value in _OF_ANY_NUMBER
+    of_any_number = _called(call) in _OF_ANY_NUMBER
     for number, argument in enumerate(call.args):
+        if argument.keyword is not None and argument.keyword.value in _FOR_READERS:
+            continue
         if argument.keyword is not None or (of_any_number and len(call.args) > 1):
             yield call.with_changes(args=[*call.args[:number], *call.args[number + 1 :]])
 
 
+def _called(call: cst.Call) -> str:
+    """The name of the function or method that is called; empty for none."""
+    name = call.func.attr if isinstance(call.func, cst.Attribute) else call.func
+    return name.value if isinstance(name, cst.Name) else ""
+
+
 def _exchanged(call: cst.Call) -> Iterator[cst.CSTNode]:
     """A call with the values of two neighbouring arguments exchanged."""
+    if _called(call) in _SYMMETRIC:
+        return
     for number, (one, other) in enumerate(itertools.pairwise(call.args)):
         if one.star == other.star == "":
             pair = [one.with_changes(value=other.value), other.with_changes(value=one.value)]

@@ -1,11 +1,14 @@
 """Which tests run a line: recorded once for each module of tests, again when it or the code changes.
 
+A record serves all modules of the code whose files are what they were when it was made.
+
 No line of a compiled kernel is seen to run, nor that of a constant, or of a function that remembers
 what it returns, by all tests that need its value: these have the tests of the lines that use them.
 """
 
 import ast
 import json
+import math
 import os
 import subprocess
 import sys
@@ -15,11 +18,16 @@ from dataclasses import dataclass
 from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
+from typing import Any
 
 from mutants.changes import Mutant
-from mutants.modules import Module
+from mutants.modules import ALL, SHORT, Module
 
 Lines = dict[str, dict[int, set[str]]]
+Document = dict[str, Any]
+"""What was recorded, as JSON: `seconds` of each test, tests of `lines` of files, checksums of `code`."""
+SECONDS_OF_A_FILE = {ALL: 240.0, SHORT: 40.0}
+"""Time in which tests of one file begin while they are recorded, by marks: later ones are not tried."""
 
 
 @dataclass(frozen=True)
@@ -82,10 +90,9 @@ class Coverage:
     @cached_property
     def _statements(self) -> list[tuple[str, ast.stmt]]:
         """The statements of all modules, each with its file."""
-        files = [*self.root.glob("services/**/*.py"), *self.root.glob("app/**/*.py")]
         return [
             (str(file.relative_to(self.root)), statement)
-            for file in files
+            for file in _code(self.root)
             for statement in ast.parse(file.read_text()).body
         ]
 
@@ -116,6 +123,11 @@ def _defined(statement: ast.stmt) -> str:
     return next((target.id for target in targets if isinstance(target, ast.Name)), "")
 
 
+def _code(root: Path) -> list[Path]:
+    """All files of the code."""
+    return [*root.glob("services/**/*.py"), *root.glob("app/**/*.py")]
+
+
 def recorded_coverage(root: Path, kept: Path, module: Module) -> Coverage:
     """The coverage of a module by its tests; what has changed is recorded again.
 
@@ -124,52 +136,89 @@ def recorded_coverage(root: Path, kept: Path, module: Module) -> Coverage:
         kept: folder of the records.
         module: of which the tests run.
     """
-    code = digest(root, module.source_files(root))
-    records = {
-        test: kept / f"{test.replace('/', '.')}-{code}-{digest(root, [test])}.json"
-        for test in module.test_files(root)
-    }
-    missing = [test for test, record in records.items() if not record.exists()]
-    if missing:
-        _record(root, missing, records)
-    seconds: dict[str, float] = {}
-    lines: Lines = defaultdict(lambda: defaultdict(set))
-    for record in records.values():
-        document = json.loads(record.read_text())
-        seconds |= document["seconds"]
-        for path, of_file in document["lines"].items():
-            for line, tests in of_file.items():
-                lines[path][int(line)] |= set(tests)
-    return Coverage(root, seconds, lines)
+    tests = module.test_files(root)
+    records = {test: kept / _record_name(root, test, marks) for test, marks in tests.items()}
+    missing = [test for test, record in records.items() if not _holds(record, root, module)]
+    for marks in sorted({tests[test] for test in missing}):
+        of_these = [test for test in missing if tests[test] == marks]
+        document = _recorded(root, of_these, marks, (SECONDS_OF_A_FILE[marks], math.inf))
+        for test in of_these:
+            records[test].parent.mkdir(parents=True, exist_ok=True)
+            records[test].write_text(json.dumps(_of_one(test, document)))
+    return _joined(root, [json.loads(record.read_text()) for record in records.values()])
 
 
-def _record(root: Path, tests: Sequence[str], records: dict[str, Path]) -> None:
-    """Run modules of tests and divide what was recorded among them."""
+def _record_name(root: Path, test: str, marks: str) -> str:
+    """The name of the file in which the record of a module of tests is kept."""
+    kind = blake2b(f"{marks} {SECONDS_OF_A_FILE[marks]}".encode(), digest_size=4).hexdigest()
+    return f"{test.replace('/', '.')}-{kind}-{digest(root, [test])}.json"
+
+
+def _holds(record: Path, root: Path, module: Module) -> bool:
+    """Whether a record exists, and the code of a module is what it was then."""
+    if not record.exists():
+        return False
+    code = json.loads(record.read_text())["code"]
+    return all(code.get(path) == digest(root, [path]) for path in module.source_files(root))
+
+
+def coverage_within(root: Path, tests: Sequence[str], of_a_file_s: float, of_all_s: float) -> Coverage:
+    """The coverage by modules of tests, by short ones that begin within some seconds; not kept."""
+    return _joined(root, [_with_sets(_recorded(root, tests, SHORT, (of_a_file_s, of_all_s)))])
+
+
+def _recorded(root: Path, tests: Sequence[str], marks: str, within_s: tuple[float, float]) -> Document:
+    """Run the tests of modules that have some marks and begin within the time of a module and of all."""
     written = root / "recorded.json"
-    subprocess.run(
-        [*PYTEST, "-p", "mutants.recording", "-m", "not endurance", *tests],
-        cwd=root,
-        env=os.environ | {"MUTANTS_RECORD": str(written), "COVERAGE_CORE": "ctrace"},
-        stdout=sys.stderr,
-        check=False,
-    )
-    document = json.loads(written.read_text())
+    words = [*PYTEST, "-p", "mutants.recording", "--tb=no", "--disable-warnings", "-m", marks, *tests]
+    own = {
+        "MUTANTS_RECORD": str(written),
+        "MUTANTS_SECONDS": " ".join(map(str, within_s)),
+        "PYTHONPATH": str(root),
+        "COVERAGE_CORE": "ctrace",
+    }
+    subprocess.run(words, cwd=root, env=os.environ | own, stdout=sys.stderr, check=False)
+    document: Document = json.loads(written.read_text())
+    document["code"] = {str(path.relative_to(root)): digest(root, [str(path)]) for path in _code(root)}
     if document["failed"]:
         print("not used, as they do not pass:", *document["failed"], sep="\n  ", file=sys.stderr)
-    for test in tests:
+    return document
 
-        def own(name: str, test: str = test) -> bool:
-            return name.split("::")[0] == test
 
-        lines = {
-            path: {
-                line: kept for line, names in of_file.items() if (kept := [n for n in names if own(n)])
-            }
-            for path, of_file in document["lines"].items()
-        }
-        seconds = {name: time for name, time in document["seconds"].items() if own(name)}
-        records[test].parent.mkdir(parents=True, exist_ok=True)
-        records[test].write_text(json.dumps({"seconds": seconds, "lines": lines}))
+def _of_one(test: str, document: Document) -> Document:
+    """What was recorded of one module of tests."""
+
+    def own(names: Iterable[str]) -> list[str]:
+        return [name for name in names if name.split("::")[0] == test]
+
+    lines = {
+        path: {line: kept for line, names in of_file.items() if (kept := own(names))}
+        for path, of_file in document["lines"].items()
+    }
+    own_seconds = {name: document["seconds"][name] for name in own(document["seconds"])}
+    return _with_sets({"code": document["code"], "seconds": own_seconds, "lines": lines})
+
+
+def _with_sets(document: Document) -> Document:
+    """A record with numbers in place of tests: few sets of them run thousands of lines."""
+    numbers: dict[tuple[str, ...], int] = {}
+    lines = {
+        path: {line: numbers.setdefault(tuple(names), len(numbers)) for line, names in of_file.items()}
+        for path, of_file in document["lines"].items()
+        if of_file
+    }
+    return document | {"lines": lines, "sets": list(numbers)}
+
+
+def _joined(root: Path, documents: Iterable[Document]) -> Coverage:
+    seconds: dict[str, float] = {}
+    lines: Lines = defaultdict(lambda: defaultdict(set))
+    for document in documents:
+        seconds |= document["seconds"]
+        for path, of_file in document["lines"].items():
+            for line, number in of_file.items():
+                lines[path][int(line)].update(document["sets"][number])
+    return Coverage(root, seconds, lines)
 
 
 PYTEST = (sys.executable, "-m", "pytest", "-q", "-n0", "-p", "no:cacheprovider", "--no-header")

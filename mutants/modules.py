@@ -1,8 +1,14 @@
-"""The modules in which a fault would hurt most, each with the tests that are about it."""
+"""The modules in which a fault would hurt most, each with the tests that are about it, or import it."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+SHORT = "not (endurance or thorough or long)"
+"""Tests that are tried of files that only import a module."""
+ALL = "not endurance"
+"""Tests that are tried of files that are about a module."""
 
 
 @dataclass(frozen=True)
@@ -12,14 +18,16 @@ class Module:
     Attributes:
         name: as the user gives it.
         sources: files and folders of the code.
-        tests: files and folders of the tests that are tried.
+        tests: files and folders of the tests that are about it.
         part: file or folder whose mutants are tried; empty for all.
+        is_everywhere: whether so much imports it that the files that do are not tried.
     """
 
     name: str
     sources: tuple[str, ...]
     tests: tuple[str, ...]
     part: str = ""
+    is_everywhere: bool = False
 
     def mutated_files(self, root: Path) -> list[str]:
         """Paths of the modules of the code whose mutants are tried."""
@@ -29,9 +37,26 @@ class Module:
         """Paths of the modules of the code, relative to the root."""
         return [path for path in _python_files(root, self.sources) if not path.endswith("__init__.py")]
 
-    def test_files(self, root: Path) -> list[str]:
-        """Paths of the modules of tests, relative to the root."""
-        return [path for path in _python_files(root, self.tests) if "/test_" in path]
+    def test_files(self, root: Path) -> dict[str, str]:
+        """Paths of the modules of tests, relative to the root, each with the marks of those tried."""
+        about = [path for path in _python_files(root, self.tests) if "/test_" in path]
+        beside = [] if self.is_everywhere else importing(root, self.source_files(root))
+        return dict.fromkeys(beside, SHORT) | dict.fromkeys(about, ALL)
+
+
+def importing(root: Path, sources: Iterable[str]) -> list[str]:
+    """Modules of tests that import one of some files of the code."""
+    imports = "|".join(
+        rf"from {re.escape(name)} import|from {re.escape(package)} import [^\n]*\b{last}\b"
+        for name in ("amers." + path.removesuffix(".py").replace("/", ".") for path in sources)
+        for package, _, last in [name.rpartition(".")]
+    )
+    return [path for path in all_tests(root) if re.search(imports, (root / path).read_text())]
+
+
+def all_tests(root: Path) -> list[str]:
+    """All modules of tests of the service and of the science."""
+    return [path for path in _python_files(root, ("tests/app", "tests/services")) if "/test_" in path]
 
 
 def _of_science(name: str, *more_tests: str) -> Module:
@@ -59,14 +84,18 @@ MODULES = (
     Module(
         "services/geodesy",
         tuple(f"services/{one}.py" for one in ("geodesy", "terrain", "lines_of_sight", "map_grid")),
-        tuple(f"tests/services/test_{one}.py" for one in ("geodesy", "terrain", "map_grid")),
+        (
+            *(f"tests/services/test_{one}.py" for one in ("geodesy", "terrain", "map_grid", "datums")),
+            "tests/services/orthorectification/test_occlusion.py",
+        ),
+        is_everywhere=True,
     ),
     _of_service(
         "auth",
         "auth.py api/access.py api/credentials.py api/deps.py",
         "basic_authentication sign_in tokens oidc access_matrix engine crowd",
     ),
-    _of_service("tokens", "usecases/tokens.py db/tokens.py", "tokens oidc jobs"),
+    _of_service("tokens", "usecases/tokens.py db/tokens.py", "tokens oidc jobs sign_in"),
     _of_service("quotas", "usecases/quotas.py db/usage.py", "storage_quota jobs"),
     _of_service(
         "jobs",
@@ -90,7 +119,7 @@ MODULES = (
         "usecases/garbage_collection.py usecases/retention.py worker/sweep.py",
         "sweep retention job_leases storage_identity storage",
     ),
-    _of_service("config", "config.py", "config"),
+    replace(_of_service("config", "config.py", "config wrong_use"), is_everywhere=True),
     _of_service(
         "cli",
         "cli",

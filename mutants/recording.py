@@ -1,11 +1,13 @@
 """A plugin of pytest that records which test runs which line, and how long each test takes.
 
 Lines that a fixture runs for several tests count for all tests of the module that asks for it first.
-The variable MUTANTS_RECORD names the file that is written.
+MUTANTS_RECORD names the file that is written; MUTANTS_SECONDS has the time in which the tests of one
+module begin, and that of all: those after it are skipped, and one that goes on is ended.
 """
 
 import json
 import os
+import signal
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,27 +16,49 @@ from typing import Any
 import coverage
 import pytest
 
+PASSED = "the time has passed"
+GRACE_S, LONGEST_S = 2.0, 600.0
+"""How long a test may go on when the time has passed, and how long it may take at most."""
 IMPORT = ""
 """Stands for the tests of lines that run when modules are imported."""
 
 _traced = coverage.Coverage(data_file=None, config_file=False, source=["amers.app", "amers.services"])
 _seconds: dict[str, float] = defaultdict(float)
+_seconds_of_files: dict[str, float] = defaultdict(float)
 _failed: set[str] = set()
+_skipped: set[str] = set()
+_OF_A_FILE_S, _OF_ALL_S = map(float, os.environ["MUTANTS_SECONDS"].split())
 
 
 def pytest_configure() -> None:
     """Begin before the code is imported."""
+    signal.signal(signal.SIGALRM, lambda *_: pytest.fail(PASSED))
     _traced.start()
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Count lines for a test."""
+    """Count lines for a test, and end it when the time has passed."""
     _traced.switch_context(item.nodeid)
+    signal.setitimer(signal.ITIMER_REAL, min(max(_left_s(item), 0.0) + GRACE_S, LONGEST_S))
     try:
         return (yield)
     finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
         _traced.switch_context(IMPORT)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip a test, before its fixtures, when the time has passed."""
+    if _left_s(item) <= 0.0:
+        pytest.skip(PASSED)
+
+
+def _left_s(item: pytest.Item) -> float:
+    """What is left of the time of a test's module, and of all."""
+    of_file_s = _seconds_of_files[item.nodeid.split("::")[0]]
+    return min(_OF_A_FILE_S - of_file_s, _OF_ALL_S - sum(_seconds_of_files.values()))
 
 
 @pytest.hookimpl(wrapper=True)
@@ -57,8 +81,11 @@ def _current(request: pytest.FixtureRequest) -> str:
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
     """Add up the time of a test, and note the tests that do not pass."""
     _seconds[report.nodeid] += report.duration
-    if not report.passed:
+    _seconds_of_files[report.nodeid.split("::")[0]] += report.duration
+    if report.failed:
         _failed.add(report.nodeid)
+    elif report.skipped:
+        _skipped.add(report.nodeid)
 
 
 def pytest_sessionfinish() -> None:
@@ -73,6 +100,6 @@ def pytest_sessionfinish() -> None:
         # `amers` links to the folders in which the files lie.
         path = Path(name).resolve().relative_to(root)
         lines[str(path)] = {line: t for line, t in of_file.items() if t}
-    seconds = {test: time for test, time in _seconds.items() if test not in _failed}
+    seconds = {test: time for test, time in _seconds.items() if test not in _failed | _skipped}
     document = {"seconds": seconds, "failed": sorted(_failed), "lines": lines}
     Path(os.environ["MUTANTS_RECORD"]).write_text(json.dumps(document))

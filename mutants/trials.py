@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 import subprocess
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,7 +15,8 @@ from tempfile import TemporaryDirectory
 from typing import Literal
 
 from mutants.changes import Mutant
-from mutants.covering import PYTEST
+from mutants.covering import PYTEST, Coverage
+from mutants.report import Trial
 
 State = Literal["killed", "survived", "timeout", "no tests"]
 START_S = 120.0
@@ -33,6 +35,52 @@ def copied_project(root: Path) -> Iterator[Path]:
         yield copy
 
 
+def tried(
+    coverage: Coverage,
+    module: str,
+    mutant: Mutant,
+    limit_s: float,
+    *,
+    digests: tuple[str, str] = ("", ""),
+    start_s: float = START_S,
+) -> Trial:
+    """Try a mutant with the tests that run it, the fastest first.
+
+    Args:
+        coverage: of the copy in which it is tried.
+        module: for which it is.
+        mutant: that is tried.
+        limit_s: time of the tests; the first is run however long it takes.
+        digests: of the mutant's file and of the module's tests.
+        start_s: longest time until the first test begins.
+    """
+    covering = coverage.tests_of(mutant)
+    chosen, expected_s = list[str](), 0.0
+    for test in covering:
+        expected_s += coverage.seconds[test]
+        if chosen and expected_s > limit_s:
+            break
+        chosen.append(test)
+    begun = time.monotonic()
+    longest_s = TIMES_LONGER * min(expected_s, limit_s) + start_s
+    state = Workplace(coverage.root).outcome(mutant, chosen, longest_s)
+    return Trial(
+        module=module,
+        key=mutant.key,
+        path=mutant.path,
+        line=mutant.lines[0],
+        definition=mutant.definition,
+        before=mutant.before,
+        after=mutant.after,
+        state=state,
+        tests=len(chosen),
+        covering=len(covering),
+        seconds=time.monotonic() - begun,
+        code=digests[0],
+        test_code=digests[1],
+    )
+
+
 @dataclass(frozen=True)
 class Workplace:
     """A copy of the project in which mutants are tried.
@@ -43,18 +91,18 @@ class Workplace:
 
     root: Path
 
-    def outcome(self, mutant: Mutant, tests: Sequence[str], expected_s: float) -> State:
+    def outcome(self, mutant: Mutant, tests: Sequence[str], longest_s: float) -> State:
         """Whether one of some tests notices a mutant.
 
         Args:
             mutant: of a file of this copy.
             tests: those that are run.
-            expected_s: time that they take without it.
+            longest_s: after which a run that has not ended is a timeout.
         """
         if not tests:
             return "no tests"
         with self._changed(mutant):
-            return self._run(tests, TIMES_LONGER * expected_s + START_S)
+            return self._run(tests, longest_s)
 
     def _run(self, tests: Sequence[str], limit_s: float) -> State:
         process = subprocess.Popen(
