@@ -16,7 +16,7 @@ PYTEST := $(BIN)/python -m pytest -p no:schemathesis --dist loadfile --no-loadsc
 APART := not endurance and not qgis
 LONG := cape_verde continent distorted real_scenes faults image_selection load stress throughput block_adjustment block_parts toutin
 
-.PHONY: demo test test-thorough test-files test-operations test-shuffled test-fast test-security test-endurance test-qgis check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput mutants postgis page chromium proxies pictures plugin release
+.PHONY: demo test test-thorough test-files test-operations test-shuffled test-fast test-security test-endurance test-qgis check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput mutants mutants-changed postgis page chromium proxies pictures plugin release
 
 demo: postgis page
 	@$(BIN)/amers demo
@@ -82,6 +82,10 @@ release: postgis page
 # What was broken off goes on; SAMPLE=200 tries more of each module.
 mutants: postgis
 	$(BIN)/python -m mutants $(MODULE) $(if $(SAMPLE),--sample $(SAMPLE)) $(if $(SINCE),--since $(SINCE))
+
+# A handful, of lines changed since the branch left origin/main, or since SINCE: a report within a minute.
+mutants-changed: postgis
+	$(BIN)/python -m mutants.changed --within 60 $(if $(SINCE),--since $(SINCE))
 
 pictures: page chromium
 	$(BIN)/python scripts/make_pictures.py demo-output
