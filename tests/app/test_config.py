@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from amers.app.config import Settings, read_settings
+from amers.app.config import RENAMED, Settings, read_settings, use_folder
 from amers.app.errors import InputError
 
 
@@ -102,45 +102,62 @@ def test_rights_of_an_issuer_have_the_names_of_the_scopes_that_they_grant():
     assert set(granted.values()) == {"read", "register", "monitor", "admin"}
 
 
-@pytest.mark.parametrize(
-    ("name", "accepted", "refused"),
-    [
-        ("PORT", ("1", "65535"), ("0", "65536")),
-        ("POOL_SIZE", ("1", "100"), ("0", "101")),
-        ("UPLOAD_LIMIT_BYTES", ("1",), ("0", "1.5")),
-        ("BODY_LIMIT_BYTES", ("1",), ("0",)),
-        ("HEAD_SECONDS", ("0.001",), ("0", "-1")),
-        ("BODY_SECONDS", ("0.001",), ("0",)),
-        ("RATE_SECONDS", ("0.001",), ("0",)),
-        ("READ_TIMEOUT_SECONDS", ("0.001",), ("0",)),
-        ("LEASE_SECONDS", ("0.001",), ("0",)),
-        ("JOB_SECONDS", ("0.001",), ("0",)),
-        ("LEAST_RATE_BYTES", ("1",), ("0",)),
-        ("CONNECTIONS", ("1",), ("0",)),
-        ("CONNECTIONS_PER_ADDRESS", ("1",), ("0",)),
-        ("JOB_MEMORY_BYTES", (str(2**26),), (str(2**26 - 1),)),
-        ("JOB_FILE_BYTES", (str(2**20),), (str(2**20 - 1),)),
-        ("MIN_FREE_BYTES", ("0",), ("-1",)),
-        ("TRASH_DAYS", ("0",), ("-0.1",)),
-        ("RESULT_DAYS", ("0.1", "never"), ("0", "ever")),
-        ("JOB_RECORD_DAYS", ("0.1", " Never "), ("0",)),
-        ("AUDIT_DAYS", ("30", "never"), ("29.9",)),
-        ("QUOTA_STORAGE_BYTES", ("0",), ("-1",)),
-        ("QUOTA_OPEN_UPLOADS", ("0",), ("-1",)),
-        ("QUOTA_JOBS", ("0",), ("-1",)),
-        ("QUOTA_KEPT_JOBS", ("0",), ("-1",)),
-        ("JOBS_RUNNING_PER_OWNER", ("1",), ("0",)),
-        (
-            "STORAGE_URL",
-            ("s3://chips", "s3://chips/of/amers/"),
-            ("s3://", "https://chips", "s3://a/../b c"),
-        ),
-        ("TRUSTED_PROXIES", ("10.0.0.5,10.1.0.0/24", ""), ("10.1.0.1/24", "proxy")),
-        ("LOG_FORMAT", ("text", "json"), ("xml",)),
-        ("LOG_LEVEL", ("debug", "error"), ("loud",)),
-    ],
-)
+LIMITS = [
+    ("PORT", ("1", "65535"), ("0", "65536")),
+    ("POOL_SIZE", ("1", "100"), ("0", "101")),
+    ("UPLOAD_LIMIT_BYTES", ("1",), ("0", "1.5")),
+    ("BODY_LIMIT_BYTES", ("1",), ("0",)),
+    ("HEAD_SECONDS", ("0.001",), ("0", "-1")),
+    ("BODY_SECONDS", ("0.001",), ("0",)),
+    ("RATE_SECONDS", ("0.001",), ("0",)),
+    ("READ_TIMEOUT_SECONDS", ("0.001",), ("0",)),
+    ("LEASE_SECONDS", ("0.001",), ("0",)),
+    ("JOB_SECONDS", ("0.001",), ("0",)),
+    ("LEAST_RATE_BYTES", ("1",), ("0",)),
+    ("CONNECTIONS", ("1",), ("0",)),
+    ("CONNECTIONS_PER_ADDRESS", ("1",), ("0",)),
+    ("JOB_MEMORY_BYTES", (str(2**26),), (str(2**26 - 1),)),
+    ("JOB_FILE_BYTES", (str(2**20),), (str(2**20 - 1),)),
+    ("MIN_FREE_BYTES", ("0",), ("-1",)),
+    ("TRASH_DAYS", ("0",), ("-0.1",)),
+    ("RESULT_DAYS", ("0.1", "never"), ("0", "ever")),
+    ("JOB_RECORD_DAYS", ("0.1", " Never "), ("0",)),
+    ("AUDIT_DAYS", ("30", "never"), ("29.9",)),
+    ("QUOTA_STORAGE_BYTES", ("0",), ("-1",)),
+    ("QUOTA_OPEN_UPLOADS", ("0",), ("-1",)),
+    ("QUOTA_JOBS", ("0",), ("-1",)),
+    ("QUOTA_KEPT_JOBS", ("0",), ("-1",)),
+    ("JOBS_RUNNING_PER_OWNER", ("1",), ("0",)),
+    (
+        "STORAGE_URL",
+        ("s3://chips", "s3://chips/of/amers/"),
+        ("s3://", "https://chips", "s3://a/../b c"),
+    ),
+    ("TRUSTED_PROXIES", ("10.0.0.5,10.1.0.0/24", ""), ("10.1.0.1/24", "proxy")),
+    ("QUOTA_CPU_SECONDS", ("0.001",), ("0",)),
+    ("MAP_BACKGROUND", ("/{z}/{x}/{y}",), ("", "http://a.example/{z}/{x}/{y}", "https:/{z}/{x}/{y}")),
+    ("MAP_BACKGROUND_ATTRIBUTION", ("x", "x" * 200), ("", " ", "x" * 201)),
+    ("OIDC_SCOPES", ('{"all": "admin"}', "{}"), ('{"all": "root"}', "{")),
+    ("LOG_FORMAT", ("text", "json"), ("xml", "")),
+    ("LOG_LEVEL", ("debug", "info", "warning", "error"), ("loud", "")),
+]
+"""What each setting with limits accepts, at these, and what it refuses, just beyond."""
+CONSTRAINTS = ("inimum", "aximum", "maxLength", "pattern", "enum")
+"""Parts of the names that JSON Schema has for limits."""
+
+
+def test_both_sides_of_the_limits_of_every_setting_are_tried():
+    declared = {
+        name.upper()
+        for name, schema in Settings.model_json_schema()["properties"].items()
+        if any(constraint in json.dumps(schema) for constraint in CONSTRAINTS)
+    }
+    assert declared <= {name for name, *_ in LIMITS}
+
+
+@pytest.mark.parametrize(("name", "accepted", "refused"), LIMITS)
 def test_a_setting_is_accepted_up_to_its_limits_and_refused_beyond(monkeypatch, name, accepted, refused):
+    monkeypatch.setenv("AMERS_MAP_BACKGROUND_ATTRIBUTION", "its makers")
     for value in accepted:
         monkeypatch.setenv(f"AMERS_{name}", value)
         read_settings()
@@ -194,22 +211,62 @@ def test_a_background_without_the_name_of_its_makers_is_refused(monkeypatch):
         read_settings()
 
 
-@pytest.mark.parametrize("name", ["RESULT_DAYS", "JOB_RECORD_DAYS", "AUDIT_DAYS"])
-def test_what_is_never_removed_has_no_number_of_days(monkeypatch, name):
-    monkeypatch.setenv(f"AMERS_{name}", "Never")
-    assert getattr(read_settings(), name.lower()) is None
+SITES = (" https://a.example , ,https://b.example,", ("https://a.example", "https://b.example"))
 
 
-@pytest.mark.parametrize("name", ["CORS_ORIGINS", "TRUSTED_HOSTS"])
-def test_lists_are_separated_by_commas_and_blanks_do_not_count(monkeypatch, name):
-    monkeypatch.setenv(f"AMERS_{name}", " https://a.example , ,https://b.example,")
-    assert getattr(read_settings(), name.lower()) == ("https://a.example", "https://b.example")
+@pytest.mark.parametrize(
+    ("name", "value", "read"),
+    [
+        ("RESULT_DAYS", "Never", None),
+        ("RESULT_DAYS", "2.5", 2.5),
+        ("JOB_RECORD_DAYS", "Never", None),
+        ("JOB_RECORD_DAYS", "1", 1.0),
+        ("AUDIT_DAYS", "Never", None),
+        ("AUDIT_DAYS", " NEVER ", None),
+        ("AUDIT_DAYS", "365", 365.0),
+        ("CORS_ORIGINS", *SITES),
+        ("TRUSTED_HOSTS", *SITES),
+        ("CATALOGUES", *SITES),
+        ("TRUSTED_PROXIES", " 10.0.0.5 ,,10.1.0.0/24,", ("10.0.0.5/32", "10.1.0.0/24")),
+        ("OIDC_SCOPES", '{"gcp:all": "admin"}', {"gcp:all": "admin"}),
+        ("PUBLIC_URL", " ", None),
+    ],
+)
+def test_a_value_is_read_as_what_it_stands_for(monkeypatch, name, value, read):
+    monkeypatch.setenv(f"AMERS_{name}", value)
+    assert getattr(read_settings(), name.lower()) == read
 
 
-def test_a_right_that_grants_no_scope_is_refused(monkeypatch):
-    monkeypatch.setenv("AMERS_OIDC_SCOPES", json.dumps({"gcp:all": "admin"}))
-    assert read_settings().oidc_scopes == {"gcp:all": "admin"}
-    for value in ('{"gcp:all": "root"}', "{"):
-        monkeypatch.setenv("AMERS_OIDC_SCOPES", value)
-        with pytest.raises(InputError, match="AMERS_OIDC_SCOPES"):
-            read_settings()
+@pytest.mark.parametrize(("former", "present"), [("QUOTA_UPLOAD_BYTES", "QUOTA_STORAGE_BYTES")])
+def test_the_former_name_of_a_setting_is_refused_with_the_present_one(monkeypatch, former, present):
+    assert list(RENAMED) == [f"AMERS_{former}"]
+    monkeypatch.setenv(f"AMERS_{former}", "1")
+    with pytest.raises(InputError, match=f"AMERS_{former} is now AMERS_{present};"):
+        read_settings()
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        ("postgresql://amers:hush@db/amers", "'…@db/amers'"),
+        ("https://db.example/?password=hush", "'https://db.example/?…'"),
+        ("https://db.example/#hush", "'https://db.example/#…'"),
+        ("x" * 59, f"'{'x' * 59}"),
+        ("x" * 60, f"'{'x' * 59}"),
+    ],
+)
+def test_of_a_wrong_value_its_beginning_is_shown_without_what_may_be_secret(monkeypatch, value, shown):
+    monkeypatch.setenv("AMERS_PORT", value)
+    with pytest.raises(InputError) as refusal:
+        read_settings()
+    assert f"AMERS_PORT: {shown} found; " in str(refusal.value)
+
+
+def test_a_process_can_be_bound_to_a_folder_whatever_the_environment_says(monkeypatch, tmp_path):
+    monkeypatch.setenv("AMERS_DATABASE_URL", "postgresql://amers@db/amers")
+    monkeypatch.setenv("AMERS_STORAGE_URL", "s3://chips")
+    monkeypatch.setenv("AMERS_DATA_FOLDER", "/elsewhere")
+    use_folder(tmp_path)
+    settings = read_settings()
+    assert (settings.database_url, settings.storage_url) == (None, None)
+    assert settings.data_folder == tmp_path

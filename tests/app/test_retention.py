@@ -5,11 +5,11 @@ from uuid import UUID
 import psycopg
 import pytest
 
-from amers.app.config import Settings, read_settings
+from amers.app.config import Settings
 from amers.app.db.audit import list_changes
 from amers.app.db.engine import Connection, Database
 from amers.app.db.jobs import attempts, jobs
-from amers.app.errors import InputError, NotFound
+from amers.app.errors import NotFound
 from amers.app.request_context import Origin, working_for
 from amers.app.storage import Storage
 from amers.app.usecases.results import result_key
@@ -283,35 +283,3 @@ def test_a_removed_job_leaves_its_owner_in_the_audit(connection: Connection, dat
     recorded = list_changes(connection, 10, None, "job", str(job.id))
     assert [change.action for change in recorded] == ["deleted", "changed", "created"]
     assert recorded[1].actor == owner.id
-
-
-@pytest.mark.parametrize(
-    ("variable", "value", "kept_days"),
-    [
-        ("AMERS_RESULT_DAYS", "never", None),
-        ("AMERS_JOB_RECORD_DAYS", "Never", None),
-        ("AMERS_AUDIT_DAYS", "never", None),
-        ("AMERS_RESULT_DAYS", "2.5", 2.5),
-    ],
-)
-def test_never_keeps_what_a_setting_would_remove(
-    variable: str, value: str, kept_days: float | None, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setenv(variable, value)
-    assert getattr(read_settings(), variable.removeprefix("AMERS_").lower()) == kept_days
-
-
-@pytest.mark.parametrize(
-    ("variable", "value", "message"),
-    [
-        ("AMERS_RESULT_DAYS", "sometimes", "AMERS_RESULT_DAYS"),
-        ("AMERS_AUDIT_DAYS", "29", "greater than or equal to 30"),
-        ("AMERS_QUOTA_UPLOAD_BYTES", "1000", "is now AMERS_QUOTA_STORAGE_BYTES"),
-    ],
-)
-def test_settings_that_would_not_be_followed_are_refused(
-    variable: str, value: str, message: str, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setenv(variable, value)
-    with pytest.raises(InputError, match=message):
-        read_settings()
