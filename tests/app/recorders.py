@@ -17,6 +17,7 @@ import pytest
 from pydantic import BaseModel
 from starlette.responses import Response
 
+from amers.app.config import Settings
 from tests.app.stand_ins import PLACE, Anything, result_of
 
 RECORDED = ("amers.app.", "amers.services.")
@@ -46,7 +47,7 @@ class Recorders:
         """Replace the functions of other packages in the modules of a package, but some, or in one."""
         self.notes: list[tuple[str, str]] = []
         self._package = package
-        Anything.called = self._called
+        Anything.called = self.note
         for name, module in list(sys.modules.items()):
             if name.startswith(package) and name not in but:
                 for own, value in list(vars(module).items()):
@@ -68,12 +69,13 @@ class Recorders:
         name = function.__qualname__
 
         def recorder(*arguments: Any, **named: Any) -> Any:
-            self._called(name, {**dict(enumerate(arguments)), **named})
+            self.note(name, {**dict(enumerate(arguments)), **named})
             return MADE.get(name, lambda result: result)(result_of(function))
 
         return recorder
 
-    def _called(self, name: str, arguments: Mapping[int | str, Any]) -> None:
+    def note(self, name: str, arguments: Mapping[int | str, Any]) -> None:
+        """Note what something is called with, by place or name."""
         for place, value in arguments.items():
             self.notes.extend(leaves(f"{name}({place})", value))
 
@@ -110,7 +112,9 @@ def leaves(path: str, value: Any, depth: int = 0) -> Iterator[tuple[str, str]]:
 
 
 def _parts(value: Any) -> dict[str, Any] | None:
-    """What a value consists of, by its place; None for a single value."""
+    """What a value consists of, by its place, of settings no defaults; None for a single value."""
+    if isinstance(value, Settings):
+        return {f".{name}": one for name, one in value.model_dump(exclude_defaults=True).items()}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f".{one.name}": getattr(value, one.name, None) for one in dataclasses.fields(value)}
     if isinstance(value, BaseModel):

@@ -12,6 +12,7 @@ import re
 import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from datetime import UTC, date, datetime, timedelta
 from enum import Enum
 from pathlib import Path
@@ -27,7 +28,18 @@ PLACE = "__stand_in__"
 """Attribute of a result with the path that leads to it."""
 _DEEPEST = 8
 """Levels of results in results; those below have no value."""
+_LEAST = ContextVar("least", default=False)
 _MANY: tuple[Any, ...] = (list, Sequence, Iterable, set, frozenset)
+
+
+@contextlib.contextmanager
+def least_results() -> Iterator[None]:
+    """Let what stands in be the least of its type: nothing, no, none of several, the first word."""
+    before = _LEAST.set(True)
+    try:
+        yield
+    finally:
+        _LEAST.reset(before)
 
 
 class Anything(MagicMock):
@@ -112,17 +124,18 @@ def stand_in(kind: Any, path: str, depth: int = 0) -> Any:
     """A value of a type, that follows from the path that leads to it.
 
     Texts are the path itself; numbers, times and ids come from its checksum. Of what repeats there are
-    two. What is of no known type is opaque.
+    two, and of alternatives the last, or none and the first among the least results. What is of no known
+    type is opaque.
     """
-    if depth > _DEEPEST:
-        return None
     origin, inside = typing.get_origin(kind), typing.get_args(kind)
+    if depth > _DEEPEST or (_LEAST.get() and type(None) in inside):
+        return None
     if origin is typing.Annotated:
         return stand_in(inside[0], path, depth)
     if origin in (typing.Union, types.UnionType):
         return stand_in(next(one for one in inside if one is not type(None)), path, depth)
     if origin is typing.Literal:
-        return inside[-1]
+        return inside[0 if _LEAST.get() else -1]
     if origin is not None:
         return _collection(origin, inside, path, depth)
     if kind is Any:
@@ -131,20 +144,21 @@ def stand_in(kind: Any, path: str, depth: int = 0) -> Any:
 
 
 def _collection(origin: Any, inside: tuple[Any, ...], path: str, depth: int) -> Any:
-    """A list, tuple, mapping or array of two."""
+    """A list, tuple, mapping or array of two; among the least results of one, in others of none."""
+    many = int(depth == 0) if _LEAST.get() else 2
 
     def each(kinds: Iterable[Any]) -> list[Any]:
         return [stand_in(one, f"{path}[{number}]", depth + 1) for number, one in enumerate(kinds)]
 
     if origin is tuple:
         repeated = len(inside) == 2 and inside[1] is Ellipsis
-        return tuple(each(inside[:1] * 2 if repeated else inside))
+        return tuple(each(inside[:1] * many if repeated else inside))
     if origin in _MANY:
-        return each(inside[:1] * 2)
+        return each(inside[:1] * many)
     if origin is Iterator:
-        return iter(each(inside[:1] * 2))
+        return iter(each(inside[:1] * many))
     if origin in (dict, Mapping):
-        both = zip(each(inside[:1] * 2), each(inside[1:] * 2), strict=True)
+        both = zip(each(inside[:1] * many), each(inside[1:] * many), strict=True)
         return _AnyKey(() if inside[1] is Any else both, inside[1], path)
     if origin is np.ndarray:
         return _array(inside[1], path, (2,))
@@ -154,7 +168,7 @@ def _collection(origin: Any, inside: tuple[Any, ...], path: str, depth: int) -> 
 def _single(kind: type, path: str, depth: int) -> Any:
     """A value that is no collection."""
     if issubclass(kind, Enum):
-        return list(kind)[-1]
+        return list(kind)[0 if _LEAST.get() else -1]
     if issubclass(kind, BaseModel):
         kinds = {name: field.annotation for name, field in kind.model_fields.items()}
         return kind.model_construct(**_filled(kinds, path, depth))
@@ -210,7 +224,7 @@ _STATED = re.compile(r"^ +([a-z]\w*(?:, \w+)*): \((\w[^)]*),?\)", re.MULTILINE)
 _SIZES = re.compile(r"[^\s,][^,]*")
 _MAKERS: Mapping[type, Callable[[str], Any]] = {
     str: str,
-    bool: lambda _path: True,
+    bool: lambda _path: not _LEAST.get(),
     int: _number,
     float: lambda path: _number(path) / 1000.0,
     bytes: str.encode,

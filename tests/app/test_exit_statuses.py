@@ -14,7 +14,7 @@ from amers.app.cli.scene_registration import worst_status
 from amers.app.client import errors as client_errors
 from amers.services import errors as service_errors
 from tests.app.recorders import Anything, Recorders
-from tests.app.wiring import BESIDE, PACKAGE, commands_to_run, parameters, value_of
+from tests.app.wiring import BESIDE, PACKAGE, commands, parameters, value_of
 
 NO_RESULT = {
     "ComputationError",
@@ -70,7 +70,7 @@ OUTCOMES = {
     "a bug": (Reason("a bug"), 1),
 }
 
-TO_TRY = [words for words in commands_to_run() if words != ("block", "renew")]
+TO_TRY = [words for words in commands() if words != ("block", "renew")]
 """Commands; to renew a block, registrations are read first, and empty files are none."""
 
 

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from tests.app.wiring import GOLDEN, SHOWN, commands_to_run, wiring
+from tests.app.wiring import GOLDEN, NO_OPTIONS, commands, wiring
 
 pytestmark = pytest.mark.thorough
 
 EXPECTED = json.loads(GOLDEN.read_text())
-NOWHERE = 31
-"""Options, of 481, whose way is not seen so: they need others in a way of their own, or what they are
+NOWHERE = 30
+"""Options, of 439, whose way is not seen so: they need others in a way of their own, or what they are
 given to is a result, for which nothing stands in. The number may not grow."""
 
 
-@pytest.mark.parametrize("words", list(commands_to_run()), ids=" ".join)
+@pytest.mark.parametrize("words", list(commands()), ids=" ".join)
 def test_options_arrive_where_they_did(words: tuple[str, ...], tmp_path: Path) -> None:
     assert wiring(words, tmp_path) == EXPECTED[" ".join(words)]
 
@@ -29,6 +29,6 @@ def test_nearly_all_options_are_seen_to_arrive() -> None:
         f"{command} {option}"
         for command, options in EXPECTED.items()
         for option, places in options.items()
-        if option not in (SHOWN, "--json") and all(place.startswith("exit status") for place in places)
+        if not option.startswith(NO_OPTIONS) and all(place.startswith("exit status") for place in places)
     ]
     assert len(nowhere) <= NOWHERE, nowhere

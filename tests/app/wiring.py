@@ -9,7 +9,7 @@ import contextlib
 import json
 import re
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import datetime
 from enum import Enum
 from pathlib import Path
@@ -23,19 +23,27 @@ from typer.testing import CliRunner
 from amers.app.cli.commands import COMMANDS
 from amers.app.cli.main import app
 from amers.app.cli.on_demand import Group, Tree, _load
+from amers.app.cli.supervisor import Supervisor
 from amers.app.request_context import Origin
 from tests.app.recorders import Recorders
+from tests.app.stand_ins import Anything, least_results
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "wiring.json"
 PACKAGE = "amers.app.cli."
 SHOWN = "what is shown"
 """Beside the options of a command: its result, as it goes to the terminal."""
+HANDED_ON = "what is handed on"
+"""Beside the options of a command: all that it calls something with when no option is given."""
+LEAST = "what is shown of the least"
+"""Beside the options of a command: what is shown of results in which nothing is true, known or found."""
+WITH = "with"
+"""Beside the options of a command: what those add that others need."""
+NO_OPTIONS = (SHOWN, HANDED_ON, LEAST, WITH, "--json")
 ASIDE = "(on standard error) "
 """How lines begin that are not the result."""
-SERVICES = ("demo", "serve", "worker")
-"""Commands that run services, which no recorder ends."""
 AN_ID = "01234567-89ab-4cde-8f01-23456789abcd"
 TEXTS: Mapping[str, str] = {
+    "--host": "127.0.0.7",
     "--bbox": "17.01,43.02,17.03,43.04",
     "--crs": "EPSG:32617",
     "--to": "EPSG:32617",
@@ -103,11 +111,6 @@ def commands(tree: Tree = COMMANDS, words: tuple[str, ...] = ()) -> Iterator[tup
             yield from commands(entry.commands, (*words, name))
         else:
             yield (*words, name)
-
-
-def commands_to_run() -> Iterator[tuple[str, ...]]:
-    """The words of every command but of those that run services."""
-    return (words for words in commands() if words[0] not in SERVICES)
 
 
 def parameters(words: tuple[str, ...]) -> list[Any]:
@@ -181,9 +184,10 @@ def _file(parameter: Any, folder: Path) -> Path:
 def run(words: list[str], folder: Path) -> list[tuple[str, str]]:
     """What a command hands on, without the names of temporary folders."""
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setenv("AMERS_DATA_FOLDER", str(folder / "data"))
+        monkeypatch.setenv("AMERS_DATA_FOLDER", str(folder / "kept"))
         monkeypatch.chdir(folder / "empty")
         recorders = Recorders(monkeypatch, PACKAGE)
+        _record_service(recorders, monkeypatch)
         with contextlib.suppress(Exception):
             result = CliRunner().invoke(app, words)
             recorders.notes += [(SHOWN, line.rstrip()) for line in result.stdout.splitlines()]
@@ -197,6 +201,25 @@ def run(words: list[str], folder: Path) -> list[tuple[str, str]]:
     return plain
 
 
+def _record_service(recorders: Recorders, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let nothing listen, and let no process run: their descriptions are noted, and they end at once.
+
+    The demonstration places files as for a user who is not root.
+    """
+
+    def listen(address: tuple[str, int], **options: Any) -> Anything:
+        recorders.note("create_server", {"address": address, **options})
+        return Anything(name=f"socket of {address[0]}", **{"fileno.return_value": 17})
+
+    def run_children(_own: Supervisor, children: Any, at_stop: Callable[[], None]) -> None:
+        recorders.note("Supervisor.run", {"children": children})
+        at_stop()
+
+    monkeypatch.setattr("os.getuid", lambda: 1000)
+    monkeypatch.setattr("socket.create_server", listen)
+    monkeypatch.setattr(Supervisor, "run", run_children)
+
+
 def wiring(words: tuple[str, ...], folder: Path) -> dict[str, list[str]]:
     """Where each option of a command goes, and as what."""
     own = parameters(words)
@@ -204,27 +227,45 @@ def wiring(words: tuple[str, ...], folder: Path) -> dict[str, list[str]]:
     (folder / "empty").mkdir()
     beside = [str(folder / "beside") if w == "FILE" else w for w in BESIDE.get(" ".join(words), ())]
     required = [word for one in own if one.required for word in value_of(one, folder)] + beside
-    found: dict[str, list[str]] = {}
     base = run([*words, *required], folder)
-    found[SHOWN] = [text for path, text in base if path == SHOWN]
-    bases: dict[tuple[str, ...], list[tuple[str, str]]] = {(): base}
+    found = {SHOWN: _shown(base), HANDED_ON: _texts(note for note in base if note[0] != SHOWN)}
     names = {name for one in own for name in one.opts}
+    with least_results():
+        asked = [[], ["--json"]] if "--json" in names else [[]]
+        found[LEAST] = [
+            line for more in asked for line in _shown(run([*words, *required, *more], folder))
+        ]
+    bases = {(): base}
     for one in own:
         if one.required:
             value = value_of(one, folder)[-1].replace(str(folder), "FOLDER")
-            found[one.opts[0]] = sorted({f"{path} = {text}" for path, text in base if value in text})
+            found[one.opts[0]] = sorted(
+                {text for text in _texts(base) if value in text.partition(" = ")[2]}
+            )
             continue
         needs = next((more for start, more in COMPANIONS if one.opts[0].startswith(start)), ())
         with_it = _without(needs, one.opts[0], names, str(folder / "beside"))
         if with_it not in bases:
             bases[with_it] = run([*words, *required, *with_it], folder)
+            found[" ".join((WITH, *with_it[::2]))] = _moved(base, bases[with_it])
         notes = run([*words, *required, *with_it, *value_of(one, folder)], folder)
-        if one.opts[0] == "--json":
-            found[one.opts[0]] = [text for path, text in notes if path == SHOWN]
-            continue
-        moved = set(notes) - set(bases[with_it])
-        found[one.opts[0]] = sorted({f"{path} = {text}" for path, text in moved})
+        found[one.opts[0]] = _shown(notes) if one.opts[0] == "--json" else _moved(bases[with_it], notes)
     return found
+
+
+def _shown(notes: list[tuple[str, str]]) -> list[str]:
+    return [text for path, text in notes if path == SHOWN]
+
+
+def _texts(notes: Iterable[tuple[str, str]]) -> list[str]:
+    """Notes as texts, each once, in their order."""
+    return list(dict.fromkeys(f"{path} = {text}" for path, text in notes))
+
+
+def _moved(before: list[tuple[str, str]], after: list[tuple[str, str]]) -> list[str]:
+    """What an option adds to the notes; where it adds nothing, what it takes from them."""
+    added = sorted({f"{path} = {text}" for path, text in set(after) - set(before)})
+    return added or sorted({f"no {path} = {text}" for path, text in set(before) - set(after)})
 
 
 def _without(needs: tuple[str, ...], option: str, names: set[str], file: str) -> tuple[str, ...]:
@@ -240,7 +281,7 @@ def _without(needs: tuple[str, ...], option: str, names: set[str], file: str) ->
 
 if __name__ == "__main__":
     found = {}
-    for words_of_one in commands_to_run():
+    for words_of_one in commands():
         with TemporaryDirectory() as scratch:
             found[" ".join(words_of_one)] = wiring(words_of_one, Path(scratch))
     GOLDEN.write_text(json.dumps(found, indent=1) + "\n")

@@ -12,7 +12,7 @@ import re
 import sys
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import UTC, date, datetime
 from enum import Enum
 from itertools import chain
@@ -31,7 +31,7 @@ from amers.app.main import ROUTERS
 from amers.app.usecases.jobs import PROCESSES
 from amers.app.usecases.processes import Process, Work
 from tests.app.recorders import Recorders, leaves
-from tests.app.stand_ins import Anything
+from tests.app.stand_ins import Anything, least_results
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "wiring_of_jobs.json"
 Found = dict[str, list[str]]
@@ -39,10 +39,15 @@ Notes = list[tuple[str, str]]
 _CHANGING = re.compile(r" at 0x[0-9a-f]+| id='\d+'|/\d{12,}|" + re.escape(gettempdir()) + r"/[\w./-]+")
 GIVES = "gives "
 """How notes of a result begin."""
-_MOST = 100
+_MOST = 300
 """Values of a result that are compared: larger ones are documents, which have tests of their own."""
 RESULT = "what it gives"
 """Beside the inputs: the result with the least inputs, and with all."""
+HANDED_ON = "what it hands on"
+"""Beside the inputs: all that it calls something with, with the least inputs, and with all."""
+LEAST = "with the least results"
+"""Beside the inputs: what differs when nothing is true, known or found in what it calls."""
+NO_INPUTS = (RESULT, HANDED_ON, LEAST)
 _WHOLE = re.compile(r"\.inputs\.|^check_file_names\(0\)\.")
 """Notes of all inputs together, which do not tell where one of them goes."""
 
@@ -182,8 +187,12 @@ def _found(
         {name: values[name] for name in values if name not in apart},
     )
     before = [set(call(inputs)) for inputs in beside]
-    given = sorted({f"{path} = {text}" for path, text in chain(*before) if path.startswith(GIVES)})
-    found = {RESULT: given if len(given) <= _MOST else [f"{len(given)} values"]}
+    found = {RESULT: _texts(note for note in chain(*before) if note[0].startswith(GIVES))}
+    found[HANDED_ON] = _texts(note for note in chain(*before) if not note[0].startswith(GIVES))
+    with least_results():
+        found[LEAST] = _texts(
+            note for inputs in beside for note in set(call(inputs)) - set(chain(*before))
+        )
     for name, other in others.items():
         moved: set[str] = set()
         for inputs, notes in zip(beside, before, strict=True):
@@ -192,6 +201,12 @@ def _found(
             moved |= {f"no {path} = {text}" for path, text in notes - after if after < notes}
         found[name] = sorted(moved)
     return found
+
+
+def _texts(notes: Iterable[tuple[str, str]]) -> list[str]:
+    """Some notes, sorted, each once; of those that are too many their number."""
+    texts = sorted({f"{path} = {text}" for path, text in notes})
+    return texts if len(texts) <= _MOST else [f"{len(texts)} values"]
 
 
 def _is_given(hint: Any) -> bool:
