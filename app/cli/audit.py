@@ -19,13 +19,16 @@ def audit(
     limit: Annotated[int, typer.Option(help="Largest number of changes to show, 1 to 1000.")] = 50,
     kind: Annotated[
         str | None,
-        typer.Option(help="Only this kind: token, block, scene, job, point, reference_image or audit."),
+        typer.Option(
+            help="Only changes of this kind of object: token, block, scene, job, point, "
+            "reference_image or audit."
+        ),
     ] = None,
     subject: Annotated[
-        str | None, typer.Option(help="Only the thing with this id; ID@VERSION for a block.")
+        str | None, typer.Option(help="Only changes of the object with this id; ID@VERSION for a block.")
     ] = None,
     actor: Annotated[
-        str | None, typer.Option(help="Only by who has this name: a token, a user of the command line.")
+        str | None, typer.Option(help="Only changes by this token or this user of the command line.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:

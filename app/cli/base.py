@@ -54,20 +54,26 @@ def make(
     ],
     catalogue: Annotated[
         list[str],
-        typer.Option(help="STAC: address of a search API, folder or file; repeat it for more."),
+        typer.Option(
+            help="STAC catalogue: address of a search API, folder or file; repeat for several."
+        ),
     ],
     area: Annotated[
-        Path | None, typer.Option(help="Region: GeoJSON with polygons.", exists=True)
+        Path | None, typer.Option(help="Region as a GeoJSON file with polygons.", exists=True)
     ] = None,
     bbox: Annotated[
-        tuple[float, float, float, float] | None, typer.Option(help="Region: W S E N, degrees.")
+        tuple[float, float, float, float] | None,
+        typer.Option(help="Region as a bounding box W S E N in degrees."),
     ] = None,
     scene: Annotated[
-        Path | None, typer.Option(help="Region: the ground of this image, and around it.", exists=True)
+        Path | None,
+        typer.Option(help="Region as the ground of this image and its surroundings.", exists=True),
     ] = None,
     dem: Annotated[
         Path | None,
-        typer.Option(help="Heights; by default the Copernicus DEM of the catalogues.", exists=True),
+        typer.Option(
+            help="Heights of the ground; by default the Copernicus DEM of the catalogues.", exists=True
+        ),
     ] = None,
     vertical: Annotated[
         str | None, typer.Option(help="Vertical datum of --dem: ellipsoid, EGM96, EGM2008, EPSG:…")
@@ -84,11 +90,11 @@ def make(
     place: WorkOptions,
     publish: Publish = False,
     only_plan: Annotated[
-        bool, typer.Option("--plan", help="Print dates, bytes and time, and read no image.")
+        bool, typer.Option("--plan", help="Only print dates, bytes and time; read no image.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Make a base of control points for a region from an open archive of images, in one go."""
+    """Make a base of control points for a region from an open archive of images."""
     terrain = None if dem is None else TerrainFile(dem, vertical, geoid)
     request = BaseRequest(source, tuple(catalogue), area, bbox, scene, terrain, geoid, since)
     if only_plan:
@@ -115,10 +121,11 @@ def update(
     *,
     output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the block.")],
     catalogue: Annotated[
-        list[str] | None, typer.Option(help="STAC: in place of the catalogues of the base.")
+        list[str] | None,
+        typer.Option(help="STAC catalogue in place of the catalogues of the base; repeat for several."),
     ] = None,
     new_dates: Annotated[
-        int, typer.Option(help="New clear dates that every place gets.", min=1, max=20)
+        int, typer.Option(help="Number of new clear dates that every place gets.", min=1, max=20)
     ] = 2,
     version: Annotated[
         str | None, typer.Option(help="Version of the block; by default the next number.")
@@ -127,7 +134,7 @@ def update(
     publish: Publish = False,
     as_json: AsJson = False,
 ) -> None:
-    """Make the next version of a base: new dates become views, vanished points leave, gaps fill."""
+    """Make the next version of a base: add views of new dates, remove vanished points, fill gaps."""
     put = _publication(output) if publish else None
     with shown_progress() as progress:
         made = update_base(

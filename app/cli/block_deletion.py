@@ -16,10 +16,10 @@ from amers.app.usecases.installation import Installation
 
 @giving_up_reserve
 def delete(
-    reference: Annotated[str, typer.Argument(help="ID@VERSION, written out.")],
+    reference: Annotated[str, typer.Argument(help="The block with its version, ID@VERSION.")],
     as_json: AsJson = False,
 ) -> None:
-    """Delete a block that is not published, for good; its chips go into the trash."""
+    """Delete a block that is not published, permanently; its chip files go into the trash."""
     settings = read_settings()
     with engine.opened(settings) as database:
         deleted = delete_block(Installation(database, open_storage(settings), settings), reference)

@@ -22,7 +22,9 @@ def frame(
     images: Annotated[
         list[Path],
         typer.Option(
-            "--images", exists=True, help="Image of the block, in which control is found; repeat."
+            "--images",
+            exists=True,
+            help="Image of the block in which control is searched; repeat for several.",
         ),
     ],
     models: ModelChoice,
@@ -34,16 +36,17 @@ def frame(
         list[Path] | None,
         typer.Option(
             exists=True,
-            help="Control that takes no part and measures the result: blocks, or files of "
-            "points with the accuracy that --control-sigma-m and the others state; repeat for several.",
+            help="Check that takes no part in the adjustment and measures the result: block "
+            "folders, or files of points with the accuracy that --control-sigma-m and the other "
+            "control options state; repeat for several.",
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Move a block onto control that came later; its points and chips stay as they are.
+    """Move a block onto control that became available later; its points and chips stay unchanged.
 
-    The frame on the Earth is estimated again, with its covariance. Nothing is stored: `amers block
-    ingest` stages the new folder.
+    The command estimates the position of the block on the Earth again, with its covariance. It stores
+    nothing: load the new folder with `amers block ingest`.
     """
     control = options.files()
     if not (control.paths or control.orthos or control.heights):

@@ -24,7 +24,11 @@ def ingest(
     *,
     publish: Annotated[bool, typer.Option("--publish", help="Publish the block at once.")] = False,
     priority: Annotated[
-        int, typer.Option(help="Where blocks overlap, points of the greater priority are served.")
+        int,
+        typer.Option(
+            help="Priority of the block: where blocks overlap, points of the block with the "
+            "higher priority are served."
+        ),
     ] = 0,
     as_json: AsJson = False,
 ) -> None:

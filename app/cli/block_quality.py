@@ -63,11 +63,12 @@ class HeightOptions(TerrainOptions):
     Attributes:
         dem: heights to compare with: files, folders, archives, .txt lists or STAC catalogues of tiles.
         vertical: vertical datum of --dem: ellipsoid, EGM96, EGM2008, EPSG:…
-        dem_sigma_m: sigma of these heights, metres; by default that of each cell of a surface,
-            else 0.1 of their step.
-        dem_frame_sigma_m: sigma of the error that all of them share, metres.
-        exclude_heights: ground where --dem is not to be trusted; the same; repeat.
-        land_cover: image of land cover classes, to tell heights apart.
+        dem_sigma_m: sigma of single heights of --dem, metres; by default the sigma of each cell of a
+            surface, otherwise 0.1 of the grid spacing.
+        dem_frame_sigma_m: sigma of the common error of all heights of --dem, metres.
+        exclude_heights: ground where --dem must not be used: GeoJSON, or an image that is not 0 there;
+            repeat for several.
+        land_cover: image of land cover classes; errors of heights are also reported by class.
     """
 
     dem_sigma_m: FromMilli = None
@@ -98,18 +99,23 @@ class HeightOptions(TerrainOptions):
 
 
 def quality(
-    block: Annotated[str, typer.Argument(help="Folder, or number, ID or ID@VERSION of a stored block.")],
+    block: Annotated[
+        str, typer.Argument(help="Block folder, or number, ID or ID@VERSION of a stored block.")
+    ],
     *,
     site: Annotated[
         _Files,
         typer.Option(
-            exists=True, help="Reference ortho-image on a map, for checks only; repeat for others."
+            exists=True,
+            help="Reference ortho-image that the production did not use; repeat for several.",
         ),
     ] = None,
     control_site: Annotated[
         _Files,
         typer.Option(
-            exists=True, help="The same of a place that the production used as control; repeat."
+            exists=True,
+            help="Reference ortho-image of a place that the production used as control; repeat "
+            "for several.",
         ),
     ] = None,
     references: References,
@@ -117,17 +123,20 @@ def quality(
     required: Required,
     min_share: Annotated[
         float,
-        typer.Option(help="Ground that shall have the required density, percent.", min=0.0, max=100.0),
+        typer.Option(
+            help="Percentage of the ground that must have the required density.", min=0.0, max=100.0
+        ),
     ] = 100.0 * RequiredQuality.min_share,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Folder of the report, JSON and HTML.")
+        Path | None,
+        typer.Option("-o", "--output", help="Output folder for the report in JSON and HTML."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure the quality of a block: density, and accuracy against ortho-images and heights.
 
-    A stored block without any option shows the figures kept since its ingestion. Exit status 3: the
-    block misses its specification.
+    For a stored block without any option, the command prints the figures that were computed when the
+    block was ingested. The exit code is 3 if the block misses its specification.
     """
     required = replace(required, min_share=min_share / 100.0)
     sites = (

@@ -26,20 +26,24 @@ def renew(
     reference: Annotated[str, typer.Argument(help="Number of the published block, ID, or ID@VERSION.")],
     *,
     job: Annotated[
-        list[UUID] | None, typer.Option(help="Job that registered scenes on the block; repeat.")
+        list[UUID] | None,
+        typer.Option(help="Job of a service that registered scenes on the block; repeat for several."),
     ] = None,
     image: Annotated[
         list[Path] | None,
-        typer.Option(help="Image that `amers scene register` registered on this store; repeat."),
+        typer.Option(
+            help="Image that `amers scene register` registered on the points of this store; "
+            "repeat for several."
+        ),
     ] = None,
     version: Annotated[
         str, typer.Option(help="Version of the renewed block; by default the next whole number.")
     ] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Stage a version of a block with views of registered scenes and new points, without vanished ones.
+    """Stage a new version of a block: add views of registered scenes and points, remove vanished points.
 
-    Nothing changes for readers before `amers block publish`.
+    Readers get the new version only after `amers block publish`.
     """
     if not job and not image:
         raise InputError("no scene given: name registered ones with --job or --image")

@@ -27,10 +27,12 @@ def restore(reference: Reference, as_json: AsJson = False) -> None:
 
 def prioritise(
     reference: Reference,
-    priority: Annotated[int, typer.Argument(help="-1000 to 1000; new blocks have 0.")],
+    priority: Annotated[
+        int, typer.Argument(help="Priority from -1000 to 1000; new blocks have priority 0.")
+    ],
     as_json: AsJson = False,
 ) -> None:
-    """Set which of overlapping blocks is served: points of the block with the greater priority."""
+    """Set the priority of a block: where blocks overlap, the block with the higher one is served."""
     with transaction() as connection:
         block = publication.prioritise_block(connection, reference, priority)
     show_one(block_row(block), as_json=as_json)

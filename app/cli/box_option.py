@@ -13,7 +13,10 @@ HALF_THE_EARTH = 180.0
 
 BoxText = Annotated[
     str,
-    typer.Option("--bbox", help="W,S,E,N in degrees; W greater than E crosses the antimeridian."),
+    typer.Option(
+        "--bbox",
+        help="Bounding box W,S,E,N in degrees; a box with W greater than E crosses the antimeridian.",
+    ),
 ]
 
 

@@ -30,7 +30,7 @@ COMMANDS: Tree = {
             ),
             "delete": Command(
                 "block_deletion:delete",
-                "Delete a block that is not published, for good; its chips go into the trash.",
+                "Delete a block that is not published, permanently; its chip files go into the trash.",
             ),
             "export": Command(
                 "block_export:export",
@@ -48,7 +48,8 @@ COMMANDS: Tree = {
             ),
             "frame": Command(
                 "block_frame:frame",
-                "Move a block onto control that came later; its points and chips stay as they are.",
+                "Move a block onto control that became available later; its points and chips stay "
+                "unchanged.",
             ),
         },
     ),
@@ -57,7 +58,7 @@ COMMANDS: Tree = {
         {
             "make": Command(
                 "base:make",
-                "Make a base of control points for a region from an open archive of images, in one go.",
+                "Make a base of control points for a region from an open archive of images.",
             ),
             "update": Command(
                 "base:update",
@@ -81,7 +82,7 @@ COMMANDS: Tree = {
             ),
             "reach": Command(
                 "site_reach:reach",
-                "Measure how far each of several known sites carries alone.",
+                "Measure how far the effect of each known site reaches when it is the only control.",
             ),
             "query": Command(
                 "point_query:query",
@@ -94,11 +95,11 @@ COMMANDS: Tree = {
             ),
             "suspend": Command(
                 "points:suspend",
-                "Suspend a point: registrations and readers no longer get it.",
+                "Suspend a point: registrations do not use it, and readers do not get it.",
             ),
             "reinstate": Command(
                 "points:reinstate",
-                "Serve a suspended point again; its history starts again from nothing.",
+                "Serve a suspended point again, with a new, empty history.",
             ),
         },
     ),
@@ -153,7 +154,7 @@ COMMANDS: Tree = {
         {
             "canvas": Command(
                 "vector_canvas:canvas",
-                "Write a view of a raw scene without its georeferencing, to draw on its pixels in QGIS.",
+                "Write a view of a raw scene without georeferencing, for drawing on its pixels in QGIS.",
             ),
             "correct": Command(
                 "vectors:correct",
@@ -162,7 +163,7 @@ COMMANDS: Tree = {
             ),
             "project": Command(
                 "vectors:project",
-                "Bring vectors of the map into the pixel coordinates of a raw scene.",
+                "Transform vectors of the map to pixel coordinates of a raw scene.",
             ),
         },
     ),
@@ -186,7 +187,8 @@ COMMANDS: Tree = {
             ),
             "plan": Command(
                 "planning:plan",
-                "Predict the accuracy of a block, and find where one more known site helps most.",
+                "Predict the accuracy of a block, and find the place where one more known site helps "
+                "most.",
             ),
             "run": Command(
                 "image_production:run",
@@ -259,7 +261,7 @@ COMMANDS: Tree = {
                     ),
                     "restore": Command(
                         "store_trash:restore",
-                        "Put the files of a batch back, except those whose place is taken.",
+                        "Move the files of a batch back, except files whose place is occupied.",
                     ),
                     "empty": Command("store_trash:empty", "Delete all files in the trash."),
                 },
@@ -270,7 +272,7 @@ COMMANDS: Tree = {
         "Tokens of the callers of the API.",
         {
             "create": Command(
-                "token:create", "Create a token and print its secret, which is shown only now."
+                "token:create", "Create a token and print its secret, which is shown only once."
             ),
             "list": Command("token:list_tokens", "List all tokens, the newest first."),
             "revoke": Command("token:revoke", "Revoke a token: requests with its secret are refused."),
@@ -278,17 +280,17 @@ COMMANDS: Tree = {
     ),
     "demo": Command(
         "demo:demo",
-        "Run the whole work on a simulated world: images, block, store, registration, report.",
+        "Run all steps on a simulated world: images, block, store, registration, report.",
     ),
-    "serve": Command("serve:serve", "Run the API and one worker, until Ctrl-C."),
-    "worker": Command("worker:worker", "Do the jobs of the queue, one after the other, until Ctrl-C."),
+    "serve": Command("serve:serve", "Run the API and one worker until Ctrl-C."),
+    "worker": Command("worker:worker", "Run the jobs of the queue, one after another, until Ctrl-C."),
     "audit": Command(
         "audit:audit",
         "Show the last changes of tokens, blocks, scenes, jobs and points, the newest first.",
     ),
     "doctor": Command(
         "doctor:doctor",
-        "Examine this installation: versions, database, storage, page, geoid grids, room; what to do.",
+        "Check this installation: versions, database, storage, map page, geoid grids, disk space.",
     ),
 }
 """Groups and single commands in the order of the help; a test compares the lines with the docstrings."""

@@ -20,21 +20,23 @@ class MarkOptions:
     Attributes:
         control: file of ground points marked in the scene (CSV, ASP, OPF, GeoJSON, ODM, QGIS, ENVI,
             PCI); repeat for several.
-        control_sigma_m: accuracy of marked ground whose file states none: HORIZONTAL,UP, one sigma,
-            metres; by default one pixel.
-        control_frame_sigma_m: error on the Earth that all marked ground shares: HORIZONTAL,UP, one
+        control_sigma_m: accuracy of marked ground points if their file states none: HORIZONTAL,UP, one
+            sigma, metres; by default one pixel.
+        control_frame_sigma_m: common error of all marked ground points on the Earth: HORIZONTAL,UP, one
             sigma, metres.
-        control_mark_sigma_px: sigma of marks whose file states none, pixels; by default 0.5.
-        control_vertical: vertical datum of marked ground: ellipsoid, EGM96, EGM2008, EPSG:…
-        control_geoid: grid file of its geoid, GTX or GeoTIFF.
+        control_mark_sigma_px: sigma of marks if their file states none, pixels; by default 0.5.
+        control_vertical: vertical datum of the marked ground points: ellipsoid, EGM96, EGM2008, EPSG:…
+        control_geoid: grid file of the geoid of these heights, GTX or GeoTIFF.
         control_crs: reference system of x and y of a CSV, such as EPSG:32633.
-        control_columns: columns of a CSV of other names: lon=COLUMN,lat=COLUMN,…
+        control_columns: names of the columns of a CSV, if they differ from the usual ones:
+            lon=COLUMN,lat=COLUMN,…
         control_sigma_axes: axes of the sigmas of an ASP file: ecef or lat-lon-height.
-        control_dem: heights of marks whose file has none, as that of QGIS: a file, folder, archive, .txt
-            list or STAC catalogue of tiles; path or address; repeat for several.
+        control_dem: heights for marks without heights, such as those of QGIS: a file, folder, archive,
+            .txt list or STAC catalogue of tiles; path or address; repeat for several.
         control_dem_vertical: vertical datum of --control-dem: ellipsoid, EGM96, EGM2008, EPSG:…
         control_dem_geoid: grid file of the geoid of --control-dem, GTX or GeoTIFF.
-        control_dem_sigma_m: sigma of its heights, metres; by default its own, or a tenth of its posting.
+        control_dem_sigma_m: sigma of the heights of --control-dem, metres; by default the sigmas that
+            the file contains, or a tenth of its posting.
     """
 
     control: tuple[Path, ...] = ()
@@ -86,28 +88,31 @@ class ControlOptions:
     """What places a block on the Earth.
 
     Attributes:
-        control: what places the block: folder of an older block, or file of ground points marked in the
+        control: control of the block: folder of an older block, or file of ground points marked in the
             images (CSV, ASP, OPF, GeoJSON, ODM, QGIS, ENVI, PCI); repeat for several.
-        control_sigma_m: accuracy of control points whose file states none: HORIZONTAL,UP, one sigma,
+        control_sigma_m: accuracy of control points if their file states none: HORIZONTAL,UP, one sigma,
             metres.
-        control_frame_sigma_m: error on the Earth that all control points share: HORIZONTAL,UP, one
-            sigma, metres.
-        control_mark_sigma_px: sigma of marks whose file states none, pixels; by default 0.5.
+        control_frame_sigma_m: common error of all control points on the Earth: HORIZONTAL,UP, one sigma,
+            metres.
+        control_mark_sigma_px: sigma of marks if their file states none, pixels; by default 0.5.
         control_vertical: vertical datum of control points: ellipsoid, EGM96, EGM2008, EPSG:…
-        control_geoid: grid file of the control points' geoid, GTX or GeoTIFF.
+        control_geoid: grid file of the geoid of the control points, GTX or GeoTIFF.
         control_crs: reference system of x and y of a CSV, such as EPSG:32633.
-        control_columns: columns of a CSV of other names: lon=COLUMN,lat=COLUMN,…
+        control_columns: names of the columns of a CSV, if they differ from the usual ones:
+            lon=COLUMN,lat=COLUMN,…
         control_sigma_axes: axes of the sigmas of an ASP file: ecef or lat-lon-height.
-        control_ortho: ortho-image that places the block east and north: a file, or a folder, archive,
-            .vrt, .txt list or STAC catalogue of its pieces; path or address; repeat for others.
-        control_ortho_sigma_m: accuracy of --control-ortho on the Earth, one sigma a coordinate, metres;
-            by default that of the product.
-        control_dem: heights of the ground that places the block in height: a file, folder, archive, .txt
-            list or STAC catalogue of tiles; path or address; repeat for several.
+        control_ortho: ortho-image as horizontal control of the block: a file, or a folder, archive,
+            .vrt, .txt list or STAC catalogue of its pieces; path or address; repeat for several.
+        control_ortho_sigma_m: accuracy of --control-ortho on the Earth, one sigma per coordinate,
+            metres; by default the accuracy of the product.
+        control_dem: heights of the ground as vertical control of the block: a file, folder, archive,
+            .txt list or STAC catalogue of tiles; path or address; repeat for several.
         control_dem_vertical: vertical datum of --control-dem: ellipsoid, EGM96, EGM2008, EPSG:…
         control_dem_geoid: grid file of the geoid of --control-dem, GTX or GeoTIFF.
-        control_dem_sigma_m: sigma of single heights of --control-dem, metres; a surface has its own.
-        control_dem_frame_sigma_m: error that all of --control-dem has: HORIZONTAL,UP, one sigma, metres.
+        control_dem_sigma_m: sigma of single heights of --control-dem, metres; not needed for a surface,
+            which contains its sigmas.
+        control_dem_frame_sigma_m: common error of all heights of --control-dem: HORIZONTAL,UP, one
+            sigma, metres.
     """
 
     control: tuple[Path, ...] = ()

@@ -27,12 +27,12 @@ Next, before and after on the map:   amers serve --data {folder}/store
 
 
 def demo(
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder; emptied first.")] = Path(
-        "demo-output"
-    ),
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Output folder; it is emptied first.")
+    ] = Path("demo-output"),
     as_json: AsJson = False,
 ) -> None:
-    """Run the whole work on a simulated world: images, block, store, registration, report."""
+    """Run all steps on a simulated world: images, block, store, registration, report."""
     folder = _empty_folder(output)
     store = _make_store(folder)
     with shown_progress() as progress:

@@ -11,7 +11,7 @@ from amers.app.usecases.doctor import examine
 
 
 def doctor(as_json: AsJson = False) -> None:
-    """Examine this installation: versions, database, storage, page, geoid grids, room; what to do."""
+    """Check this installation: versions, database, storage, map page, geoid grids, disk space."""
     found = list(examine(read_settings()))
     show([asdict(one) for one in found], as_json=as_json)
     if any(one.status == "failed" for one in found):

@@ -36,14 +36,16 @@ class ImageOptions:
     """The images of a block: given, of a selection, or chosen from a catalogue.
 
     Attributes:
-        images: image with its model: a path, s3://BUCKET/KEY or https://…; repeat for every image.
-        catalogue: STAC catalogue to choose images from, a path or an address; the selection stays in
-            OUTPUT.selection.
-        area: GeoJSON of the ground to see, for --catalogue.
-        since: leave out images of --catalogue before this day.
-        selection: folder that `amers production select` has written.
-        sigma_m: accuracy of the models, one sigma, metres; for one of --images IMAGE=M, repeat.
-        ortho_sigma_m: the same of those that are ortho-images; by default --sigma-m.
+        images: image with its sensor model: a path, s3://BUCKET/KEY or https://…; repeat for every
+            image.
+        catalogue: STAC catalogue to choose images from, a path or an address; the selection is written
+            into OUTPUT.selection.
+        area: with --catalogue, GeoJSON of the ground that the images must show.
+        since: with --catalogue, leave out images before this day.
+        selection: output folder of `amers production select`.
+        sigma_m: accuracy of the delivered sensor models, one sigma, metres; for one of --images write
+            IMAGE=M, and repeat the option.
+        ortho_sigma_m: accuracy of images that are ortho-images, one sigma, metres; by default --sigma-m.
     """
 
     images: tuple[str, ...] = ()
@@ -94,10 +96,10 @@ class WorkOptions:
     """Where the work is done.
 
     Attributes:
-        work: folder of intermediate results, which is kept; by default OUTPUT.work, until the block is
-            complete. An interrupted production goes on from there.
-        jobs: processes on this machine.
-        cluster: address of a Dask cluster's scheduler: tcp://HOST:8786.
+        work: folder of intermediate results, from which an interrupted production continues. A folder
+            that you name here is kept; the default, OUTPUT.work, is removed when the block is complete.
+        jobs: number of processes on this machine.
+        cluster: address of the scheduler of a Dask cluster: tcp://HOST:8786.
     """
 
     work: Path | None = None
@@ -108,7 +110,7 @@ class WorkOptions:
 def run(
     given: Annotated[
         list[str] | None,
-        typer.Argument(metavar="IMAGES", help="Images with their models, as by --images."),
+        typer.Argument(metavar="IMAGES", help="Images with their sensor models; the same as --images."),
     ] = None,
     *,
     images: ImageOptions,
@@ -124,8 +126,8 @@ def run(
         Path | None,
         typer.Option(
             exists=True,
-            help="Folder BLOCK.adjustment of a block that was made from some of the same images: both "
-            "agree along their seam.",
+            help="Folder BLOCK.adjustment of a neighbouring block with some of the same images; "
+            "the new block then agrees with it along their seam.",
         ),
     ] = None,
     ground: GroundFiles,

@@ -22,36 +22,45 @@ _DEFAULT_LIMITS = ",".join(f"{limit:g}" for limit in _DEFAULT.cloud_limits_perce
 
 def select(
     catalogue: Annotated[
-        str, typer.Argument(help="STAC: folder, file (.json, .ndjson) or address of a search API.")
+        str,
+        typer.Argument(help="STAC catalogue: folder, file (.json, .ndjson) or address of a search API."),
     ],
     *,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the selection.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Output folder for the selection.")],
     area: Annotated[
-        Path | None, typer.Option(help="GeoJSON of the ground to see; by default all footprints.")
+        Path | None,
+        typer.Option(help="GeoJSON of the ground that the images must show; by default all footprints."),
     ] = None,
     since: Annotated[
         datetime | None,
         typer.Option(help="Leave out images before this day, UTC.", formats=["%Y-%m-%d"]),
     ] = None,
     min_views: Annotated[
-        int, typer.Option(help="Clear views that every place needs.", min=1, max=100)
+        int, typer.Option(help="Number of clear views that every place needs.", min=1, max=100)
     ] = _DEFAULT.min_views,
     cloud_limits: Annotated[
-        str, typer.Option(help="Cloud cover in percent, first everywhere, then where views miss.")
+        str,
+        typer.Option(
+            help="Limits of cloud cover in percent: the first limit is used everywhere, each "
+            "further limit where views are missing."
+        ),
     ] = _DEFAULT_LIMITS,
     max_snow: Annotated[
         float, typer.Option(help="Largest snow cover of an image, percent.", min=0.0, max=100.0)
     ] = _DEFAULT.max_snow_percent,
     cell_km: Annotated[
         float | None,
-        typer.Option(help="Side of a cell of the ground; by default a twelfth of an image.", min=0.01),
+        typer.Option(
+            help="Side of a ground cell, kilometres; by default a twelfth of the width of an image.",
+            min=0.01,
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Choose the fewest recent, clear and varied images that show all ground often enough.
 
-    Only the catalogue is read, no pixels. Where it has too few images below the first cloud limit, the
-    next one holds, and cloudier images count outside of their masks.
+    The command reads the catalogue only, no pixels. Where too few images are below the first cloud
+    limit, it uses the next limit, and cloudier images count outside their cloud masks.
     """
     options = SelectionOptions(
         min_views=min_views,

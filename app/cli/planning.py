@@ -15,20 +15,21 @@ from amers.services.reports.text import print_text
 
 def plan(
     configuration: Annotated[
-        Path, typer.Argument(exists=True, help="The plan: images, sites, sigmas, JSON.")
+        Path, typer.Argument(exists=True, help="JSON file of the plan: images, sites, sigmas.")
     ],
     *,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the report.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Output folder for the report.")],
     selection: Annotated[
         str | None,
-        typer.Option(help="Folder of a selection, or catalogue, whose images are planned too."),
+        typer.Option(help="Folder of a selection, or catalogue; its images are added to the plan."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Predict the accuracy of a block, and find where one more known site helps most.
+    """Predict the accuracy of a block, and find the place where one more known site helps most.
 
-    No pixel is read: places and directions of the images, sigmas of measures and models, and the
-    accuracy of known sites give the covariance that the adjustment will declare.
+    The command reads no pixels. It computes the covariance that the adjustment will state from the
+    positions and directions of the images, the sigmas of measures and models, and the accuracy of the
+    known sites.
     """
     with shown_progress() as progress:
         report = run_plan(configuration, output, selection, progress)

@@ -42,7 +42,7 @@ def experiment(
     point_sigma_m: Annotated[
         str | None,
         typer.Option(
-            help="Accuracy of known ground whose file states none: HORIZONTAL,UP, one sigma, metres."
+            help="Accuracy of known ground if its file states none: HORIZONTAL,UP, one sigma, metres."
         ),
     ] = None,
     control_points: Annotated[
@@ -54,8 +54,8 @@ def experiment(
 ) -> None:
     """Measure errors of marked points by the number of control points, the images and their base.
 
-    Some points of known ground place the images, the others check them; every image alone, every pair
-    and all images are tried.
+    Some points of known ground are control, the others check the result. The errors are measured for
+    every image alone, for every pair of images, and for all images together.
     """
     of_file = stated_by_caller(
         stated.geoid or stated.vertical, stated.crs, stated.columns, stated.sigma_axes

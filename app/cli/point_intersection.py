@@ -41,7 +41,8 @@ class GroundStatements:
         vertical: vertical datum of known ground: ellipsoid, EGM96, EGM2008, EPSG:…
         geoid: grid file of the geoid of known ground, GTX or GeoTIFF.
         crs: reference system of x and y of a CSV, such as EPSG:32633.
-        columns: columns of a CSV of other names: lon=COLUMN,lat=COLUMN,…
+        columns: names of the columns of a CSV, if they differ from the usual ones:
+            lon=COLUMN,lat=COLUMN,…
         sigma_axes: axes of the sigmas of an ASP file: ecef or lat-lon-height.
     """
 
@@ -59,14 +60,14 @@ def intersect(
     stated: GroundStatements,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="CSV, GeoJSON or GeoPackage of the points to write."),
+        typer.Option("-o", "--output", help="Output file for the points: CSV, GeoJSON or GeoPackage."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compute ground coordinates, with their accuracy, of points that are marked in several images.
 
-    Marks that disagree with two others of their point are not used, and named. Points with known ground
-    are compared with it.
+    A mark that disagrees with two other marks of the same point is not used, and the command names it.
+    Points of known ground are compared with their ground.
     """
     of_file = stated_by_caller(
         stated.geoid or stated.vertical, stated.crs, stated.columns, stated.sigma_axes

@@ -39,11 +39,16 @@ def query(
         Path | None, typer.Option("-o", "--output", help="File to write; by default standard output.")
     ] = None,
     server: Annotated[
-        str | None, typer.Option(help="Address of an Amers service whose points are asked for.")
+        str | None,
+        typer.Option(help="Address of an Amers service; its points are queried instead of the store."),
     ] = None,
     token: Annotated[
         str | None,
-        typer.Option(envvar="AMERS_TOKEN", help="Token for the service; prefer the variable."),
+        typer.Option(
+            envvar="AMERS_TOKEN",
+            help="Token for the service; the environment variable is safer, because other users "
+            "can see a command line.",
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

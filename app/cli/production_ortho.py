@@ -41,7 +41,10 @@ def ortho(
     identity: BlockIdentity,
     gsd_m: Annotated[
         str | None,
-        typer.Option(help="Ground sampling of the chips: FINE,COARSE, metres; by default the image's."),
+        typer.Option(
+            help="Ground sampling of the chips: FINE,COARSE, metres; by default the ground "
+            "sampling of the image."
+        ),
     ] = None,
     points: Points,
     as_json: AsJson = False,

@@ -40,12 +40,14 @@ class StatementOptions:
 
     Attributes:
         vertical: vertical datum of the points: ellipsoid, EGM96, EGM2008, EPSG:…
-        geoid: grid file of the points' geoid, GTX or GeoTIFF.
+        geoid: grid file of the geoid of the points, GTX or GeoTIFF.
         crs: reference system of x and y of a CSV, such as EPSG:32633.
-        columns: columns of a CSV of other names: lon=COLUMN,lat=COLUMN,…
+        columns: names of the columns of a CSV, if they differ from the usual ones:
+            lon=COLUMN,lat=COLUMN,…
         sigma_axes: axes of the sigmas of an ASP file: ecef or lat-lon-height.
-        point_sigma_m: accuracy of points whose file states none: HORIZONTAL,UP, one sigma, metres.
-        dem: heights of points without any: a file, or a folder or .txt list of tiles.
+        point_sigma_m: accuracy of the points if their file states none: HORIZONTAL,UP, one sigma,
+            metres.
+        dem: heights for points without heights: a file, or a folder or .txt list of tiles.
         dem_vertical: vertical datum of --dem.
         dem_geoid: grid file of the geoid of --dem.
     """
@@ -79,12 +81,15 @@ def points(
     identity: BlockIdentity,
     gsd_m: Annotated[
         str | None,
-        typer.Option(help="Ground sampling of the chips: FINE,COARSE, metres; by default the images'."),
+        typer.Option(
+            help="Ground sampling of the chips: FINE,COARSE, metres; by default the ground "
+            "sampling of the images."
+        ),
     ] = None,
     options: Annotated[KnownPointOptions, Shown(min_views=typer.Option(min=1))],
     as_json: AsJson = False,
 ) -> None:
-    """Make a block of the points of another base, with its own chips or from images that show them."""
+    """Make a block from the points of another base, with chips of that base or from your images."""
     if gsd_m is not None:
         fine_m, coarse_m = sampling_pair(gsd_m)
         options = replace(options, fine_gsd_m=fine_m, coarse_gsd_m=coarse_m)

@@ -14,17 +14,19 @@ from amers.app.usecases.references import NewReference
 
 
 def add(
-    image: Annotated[str, typer.Argument(help="Ortho-image: path below AMERS_REFERENCE_FOLDER.")],
+    image: Annotated[str, typer.Argument(help="Path of the ortho-image below AMERS_REFERENCE_FOLDER.")],
     *,
     name: Annotated[str, typer.Option(help="Unique name of the reference.")],
     dem: Annotated[
-        str | None, typer.Option(help="Heights of the same ground: path below the same folder.")
+        str | None,
+        typer.Option(help="Path of the heights of the same ground, below AMERS_REFERENCE_FOLDER."),
     ] = None,
     vertical: Annotated[
         str | None, typer.Option(help="Vertical datum of the heights: ellipsoid, EGM96, EPSG:…")
     ] = None,
     geoid: Annotated[
-        str | None, typer.Option(help="Grid file of the geoid: path below the same folder.")
+        str | None,
+        typer.Option(help="Path of the grid file of the geoid, below AMERS_REFERENCE_FOLDER."),
     ] = None,
     sigma_m: Annotated[
         float | None,
@@ -32,7 +34,9 @@ def add(
     ] = None,
     sigma_up_m: Annotated[
         float | None,
-        typer.Option(help="Accuracy of its heights on the Earth, one sigma, metres.", min=0.001),
+        typer.Option(
+            help="Accuracy of the heights of the reference on the Earth, one sigma, metres.", min=0.001
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -40,15 +40,16 @@ class ControlOptions:
     """What scenes are registered on; by default the points of the store.
 
     Attributes:
-        block: use the points of this block folder instead of the store.
+        block: block folder whose points are used instead of the store.
         reference: ortho-image to register on, or its pieces: file, folder, .SAFE, .zip, .vrt, .txt list
-            or STAC catalogue; path or address; repeat for several; with --block only where it has no
-            points.
-        dem: heights of the reference's ground, or their tiles: the same.
-        vertical: vertical datum of these heights: ellipsoid, EGM96, EPSG:…
+            or STAC catalogue; path or address; repeat for several. With --block, it is used only if the
+            block has no points in the scene.
+        dem: heights of the ground of --reference, in one file or in pieces, with the same choices as for
+            --reference.
+        vertical: vertical datum of the heights of --dem: ellipsoid, EGM96, EPSG:…
         geoid: grid file of the geoid, GTX or GeoTIFF; also its name among PROJ's grids.
         reference_sigma_m: accuracy of the reference on the Earth, one sigma, metres.
-        reference_sigma_up_m: accuracy of its heights on the Earth, one sigma, metres.
+        reference_sigma_up_m: accuracy of the heights of the reference on the Earth, one sigma, metres.
     """
 
     block: Path | None = None
@@ -86,9 +87,12 @@ class SceneOptions:
 
     Attributes:
         bands: bands to use: 2, or 1,2,3 for their mean, or 3:0.3,2:0.7.
-        mask: image of the same ground; pixels that are not 0 are not used.
-        check_points: points held out: ASP, QGIS, ENVI, ODM, PCI, GeoJSON or OPF.
-        check_heights: vertical datum of the check points, if not in the file: ellipsoid, EPSG:…
+        mask: image of the same ground, used as a mask: pixels of the scene are ignored where it is not
+            0.
+        check_points: file of check points, which take no part in the adjustment: ASP, QGIS, ENVI, ODM,
+            PCI, GeoJSON or OPF.
+        check_heights: vertical datum of the check points if the file does not state it: ellipsoid,
+            EPSG:…
     """
 
     bands: str | None = None
@@ -123,9 +127,10 @@ class ResultOptions:
     """What a registration must reach, and where its result goes.
 
     Attributes:
-        max_ce90_on_earth_m: largest CE90 on the Earth, metres: with the frame of the points.
-        copy_image: copy a GeoTIFF with the refined model in its tags.
-        output: folder; each of several scenes gets one inside it.
+        max_ce90_on_earth_m: largest allowed CE90 on the Earth, metres, including the common error of the
+            points.
+        copy_image: also write a copy of a GeoTIFF with the refined model in its tags.
+        output: output folder; with several scenes, each scene gets its own folder inside it.
     """
 
     max_ce90_on_earth_m: FromMilli = None
@@ -138,9 +143,10 @@ class WorkOptions:
     """Who does the work.
 
     Attributes:
-        jobs: number of scenes registered at once, each in a process.
-        server: address of an Amers service that does the registration.
-        token: token for the service; prefer the variable.
+        jobs: number of scenes that are registered at once, each in its own process.
+        server: address of an Amers service that registers the scenes instead of this machine.
+        token: token for the service; the environment variable is safer, because other users can see a
+            command line.
     """
 
     jobs: Annotated[int, typer.Option(min=1)] = 1
@@ -172,14 +178,20 @@ def register(
     scenes: Annotated[
         list[Path],
         typer.Argument(
-            help="GeoTIFF, JPEG 2000, NITF, DIM_….XML or .TIL of tiles, or folders of these."
+            help="Images: GeoTIFF, JPEG 2000, NITF, DIM_….XML or .TIL of a product in tiles, or "
+            "folders of these."
         ),
     ],
     *,
     control: ControlOptions,
     marks: MarkOptions,
     sigma_m: Annotated[
-        float | None, typer.Option(help="Accuracy of the model, one sigma, metres.", min=0.01)
+        float | None,
+        typer.Option(
+            help="Accuracy of the delivered sensor model, one sigma, metres; the search covers "
+            "three times this value.",
+            min=0.01,
+        ),
     ] = None,
     models: ModelChoice,
     options: SceneOptions,
@@ -189,11 +201,13 @@ def register(
 ) -> None:
     """Refine the sensor models of scenes on control points; write report, points and refined models.
 
-    Each of several scenes gets a folder in the output folder, and a failed one does not stop the others.
-    An older result in a folder is replaced as a whole; other files there are refused.
+    With several scenes, each scene gets its own folder in the output folder, and a failed scene does not
+    stop the others. A result replaces an older result in its folder as a whole. A folder with other
+    files is refused.
 
     The points come from the store unless --block, --reference, --control or --server is given. With
-    --control alone, the scene is registered on what a person marked in it: one mark gives a shift.
+    --control alone, the scene is registered on marks that a person set in it: one mark determines a
+    shift.
     """
     images = images_of(scenes)
     is_one_scene = len(scenes) == len(images) == 1 and not scenes[0].is_dir()

@@ -30,9 +30,9 @@ class MapOptions:
     """The map of a mosaic.
 
     Attributes:
-        crs: reference system of the map; by default the UTM zone of the middle of all scenes.
-        gsd_m: ground sampling, metres; by default that of the finest scene.
-        bbox: only this ground, W,S,E,N in degrees; scenes outside it are left out.
+        crs: reference system of the map; by default the UTM zone at the centre of all scenes.
+        gsd_m: pixel size of the map, metres; by default the ground sampling of the finest scene.
+        bbox: bounding box of the map, W,S,E,N in degrees; scenes outside it are left out.
     """
 
     crs: str | None = None
@@ -59,9 +59,11 @@ class MadeOptions:
     Attributes:
         height_m: height of flat ground above the ellipsoid, metres; replaces --dem.
         level: change the grey values of the scenes so that they agree where they overlap.
-        anchor: name of the scene whose grey values stay with --level; by default the mean of all stays.
+        anchor: with --level, name of the scene whose grey values stay unchanged; by default the mean of
+            all scenes stays unchanged.
         feather_px: width of the strip along a seam in which both scenes are blended, pixels.
-        hide: leave out ground that other ground hides from a scene; other scenes fill it.
+        hide: do not use a scene where the ground is hidden from it by other ground; other scenes fill
+            this ground.
         kernel: interpolation: cubic or bilinear.
     """
 
@@ -99,9 +101,9 @@ def mosaic(
 ) -> None:
     """Make an ortho-image of scenes, cut where they agree best; measure the steps at seams.
 
-    Writes a cloud-optimised GeoTIFF; NAME.sources.tif, the number of the scene of each pixel; and
-    NAME.seams.gpkg, the ground that each scene shows. With --registered or --block, the steps are also
-    measured with the delivered models.
+    The command writes three files: a cloud-optimised GeoTIFF, NAME.sources.tif with the scene number of
+    each pixel, and NAME.seams.gpkg with the ground that each scene shows. With --registered or --block,
+    it also measures the steps with the delivered models.
     """
     with shown_progress() as progress:
         written = run_mosaic(

@@ -23,7 +23,8 @@ def ortho(
     scene: Annotated[
         Path,
         typer.Argument(
-            exists=True, help="GeoTIFF, JPEG 2000, NITF, or DIM_….XML, .TIL or folder of tiles."
+            exists=True,
+            help="Image: GeoTIFF, JPEG 2000, NITF, or DIM_….XML, .TIL or folder of a product in tiles.",
         ),
     ],
     *,
@@ -33,7 +34,8 @@ def ortho(
         typer.Option(
             exists=True,
             file_okay=False,
-            help="Folder of the scene's registration; its model is used. By default the delivered one.",
+            help="Folder of the registration of the scene, whose model is used; by default the "
+            "delivered model.",
         ),
     ] = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="GeoTIFF to write.")],

@@ -17,7 +17,8 @@ def straighten(
     scene: Annotated[
         Path,
         typer.Argument(
-            exists=True, help="GeoTIFF, JPEG 2000, NITF, or DIM_….XML, .TIL or folder of tiles."
+            exists=True,
+            help="Image: GeoTIFF, JPEG 2000, NITF, or DIM_….XML, .TIL or folder of a product in tiles.",
         ),
     ],
     *,
@@ -26,14 +27,14 @@ def straighten(
         typer.Option(
             exists=True,
             file_okay=False,
-            help="Folder of the scene's registration, as `amers scene register -o` writes it.",
+            help="Folder of the registration of the scene, the output of `amers scene register`.",
         ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="GeoTIFF to write.")],
     models: ModelChoice,
     as_json: AsJson = False,
 ) -> None:
-    """Resample a registered scene whose lines or samples moved, so that an RPC carries its model."""
+    """Resample a registered scene with displaced lines or samples, so that an RPC fits its model."""
     model, crop_origin = models.of([scene])[scene]
     with shown_progress() as progress:
         made = run_straightening(ImageFiles(scene, model, crop_origin), registered, output, progress)

@@ -22,14 +22,16 @@ class JointOptions:
     """What scenes are registered on together, and what the result must reach.
 
     Attributes:
-        block: use the points of this block folder instead of the store.
-        join: output folder of scenes registered together before; they stay as they are.
-        sigma_m: accuracy of the models, one sigma, metres; for one of the images IMAGE=M, repeat.
+        block: block folder whose points are used instead of the store.
+        join: output folder of scenes that were registered together before; they stay unchanged.
+        sigma_m: accuracy of the delivered sensor models, one sigma, metres; for one of the images write
+            IMAGE=M, and repeat the option.
         bands: bands to use: 2, or 1,2,3 for their mean, or 3:0.3,2:0.7.
-        rigorous: adjust orbit, attitude and camera of the scenes whose metadata have a rigorous model:
-            srp, toutin or spot-hrv.
-        max_ce90_on_earth_m: largest CE90 on the Earth, metres: with the frame of the points.
-        copy_image: copy GeoTIFFs with the refined model in their tags.
+        rigorous: adjust orbit, attitude and camera of scenes whose metadata contain a rigorous model;
+            the value is the set of parameters: srp, toutin or spot-hrv.
+        max_ce90_on_earth_m: largest allowed CE90 on the Earth, metres, including the common error of the
+            points.
+        copy_image: also write copies of GeoTIFFs with the refined models in their tags.
     """
 
     block: Path | None = None
@@ -46,7 +48,8 @@ def register_many(
     scenes: Annotated[
         list[Path],
         typer.Argument(
-            help="GeoTIFF, JPEG 2000, NITF, DIM_….XML or .TIL of tiles, or folders of these."
+            help="Images: GeoTIFF, JPEG 2000, NITF, DIM_….XML or .TIL of a product in tiles, or "
+            "folders of these."
         ),
     ],
     *,
@@ -54,16 +57,17 @@ def register_many(
     options: JointOptions,
     marks: MarkOptions,
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="Folder; each scene gets one inside it.")
+        Path,
+        typer.Option("-o", "--output", help="Output folder; each scene gets its own folder inside it."),
     ] = Path("registered"),
     jobs: Annotated[int, typer.Option(help="Number of processes that search images.", min=1)] = 1,
     as_json: AsJson = False,
 ) -> None:
     """Refine the models of scenes in one adjustment, on control points and tie points between them.
 
-    Scenes with few control points are held by their neighbours. One that does not fit is named and left
-    out. The folder OUTPUT/block holds the report on all scenes. The points come from the store unless
-    --block or --control is given.
+    Tie points to neighbouring scenes also determine scenes with few control points. A scene that does
+    not fit is named and left out. The folder OUTPUT/block contains the report on all scenes. The points
+    come from the store unless --block or --control is given.
     """
     rigorous = options.rigorous
     if rigorous is not None:

@@ -53,10 +53,10 @@ def serve(
         ),
     ] = None,
 ) -> None:
-    """Run the API and one worker, until Ctrl-C.
+    """Run the API and one worker until Ctrl-C.
 
-    On a terminal, with a private database and a loopback address, it prints one address that opens the
-    map, signed in; it serves until the command ends.
+    On a terminal, with a private database and a loopback address, the command prints an address that
+    opens the map without a further sign-in. The address is valid until the command ends.
     """
     if data is not None:
         use_folder(data.resolve())

@@ -38,9 +38,10 @@ class TieHeights:
         dem: heights of the points without known ground, which ortho-images need: a file, folder,
             archive, .txt list or STAC catalogue of tiles; path or address; repeat for several.
         dem_vertical: vertical datum of --dem: ellipsoid, EGM96, EGM2008, EPSG:…
-        dem_geoid: grid file of its geoid, GTX or GeoTIFF.
-        dem_sigma_m: sigma of single heights, metres; by default its own, or a tenth of its posting.
-        dem_frame_sigma_m: sigma of the error that all of them share, metres; by default 0.
+        dem_geoid: grid file of the geoid of these heights, GTX or GeoTIFF.
+        dem_sigma_m: sigma of single heights, metres; by default the sigmas that the file contains, or a
+            tenth of its posting.
+        dem_frame_sigma_m: sigma of the common error of all heights, metres; by default 0.
     """
 
     dem: Places = ()
@@ -65,8 +66,8 @@ def reach(
     site_frame_sigma_m: Annotated[
         str,
         typer.Option(
-            help="Error that all points of one site share: HORIZONTAL,UP, one sigma, metres, such as "
-            "0.05,0.05 for GNSS."
+            help="Common error of all points of one site: HORIZONTAL,UP, one sigma, metres, "
+            "such as 0.05,0.05 for GNSS."
         ),
     ],
     models: ModelChoice,
@@ -74,24 +75,25 @@ def reach(
     point_sigma_m: Annotated[
         str | None,
         typer.Option(
-            help="Accuracy of known ground whose file states none: HORIZONTAL,UP, one sigma, metres."
+            help="Accuracy of known ground if its file states none: HORIZONTAL,UP, one sigma, metres."
         ),
     ] = None,
     tie_heights: TieHeights,
     edge_sigma_m: Annotated[
         list[str] | None,
         typer.Option(
-            help="Drifts and skews of a model at the edge of its image, one sigma, metres; for one of "
-            "several images IMAGE=M, repeat. By default 0.0001 of its size."
+            help="Sigma of drift and skew of a model at the edge of its image, metres; for one "
+            "of several images write IMAGE=M, and repeat the option. By default 0.0001 of the "
+            "size of the image."
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure how far each of several known sites carries alone.
+    """Measure how far the effect of each known site reaches when it is the only control.
 
-    A block of the images knows one site, and the others check it. Each file of marks with known ground
-    is a site; points without known ground tie the images, which are adjusted with all sites, then with
-    each alone.
+    Each file of marks with known ground is a site. Points without known ground tie the images. The
+    images are adjusted with all sites, then with each site alone as control, and the other sites check
+    the result.
     """
     of_file = stated_by_caller(
         stated.geoid or stated.vertical, stated.crs, stated.columns, stated.sigma_axes

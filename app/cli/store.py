@@ -20,7 +20,7 @@ from amers.app.usecases.store_verification import Finding, verify_store
 
 
 def adopt(as_json: AsJson = False) -> None:
-    """Let the storage belong to the database, after you have checked that they belong together."""
+    """Bind the storage to the database, after you have checked that they belong together."""
     settings = read_settings()
     storage = open_storage(settings)
     with transaction(settings):
@@ -64,7 +64,7 @@ def show_usage(as_json: AsJson = False) -> None:
 
 @giving_up_reserve
 def sweep(as_json: AsJson = False) -> None:
-    """Move all files that no row of the database knows into the trash, however many they are."""
+    """Move all files that no row of the database names into the trash, without a limit."""
     settings = read_settings()
     storage = open_storage(settings)
     with engine.opened(settings) as database:
@@ -86,11 +86,12 @@ def verify(
         ),
     ] = None,
     rate: Annotated[
-        float, typer.Option(metavar="MB/S", min=0.001, help="Read no faster, megabytes per second.")
+        float,
+        typer.Option(metavar="MB/S", min=0.001, help="Largest reading rate, megabytes per second."),
     ] = 100.0,
     as_json: AsJson = False,
 ) -> None:
-    """Read every file and report what is rotten, missing or not known; exit code 1 if anything is."""
+    """Read every file and report rotten, missing and unknown files; exit code 1 if there are any."""
     settings = read_settings()
     storage = open_storage(settings)
     with engine.opened(settings) as database:

@@ -21,10 +21,12 @@ def list_trash(as_json: AsJson = False) -> None:
 
 
 def restore(
-    batch: Annotated[str, typer.Argument(help="Name of the batch, as `amers store trash list` has it.")],
+    batch: Annotated[
+        str, typer.Argument(help="Name of the batch, as `amers store trash list` prints it.")
+    ],
     as_json: AsJson = False,
 ) -> None:
-    """Put the files of a batch back, except those whose place is taken."""
+    """Move the files of a batch back, except files whose place is occupied."""
     settings = read_settings()
     storage = open_storage(settings)
     with engine.opened(settings) as database, database.reading() as connection:

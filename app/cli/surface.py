@@ -35,11 +35,12 @@ class MadeOptions:
     """How the surface is made.
 
     Attributes:
-        gsd_m: side of a cell, metres; by default the ground sampling of the finest image in two digits.
-        heights_m: lowest and highest surface above the ellipsoid: LOW,HIGH, metres; by default the
-            heights that the models are meant for.
-        pairs: number of pairs of images at most.
-        fill_cells: gaps are filled from heights at most this many cells away.
+        gsd_m: side of a cell, metres; by default the ground sampling of the finest image, rounded to two
+            digits.
+        heights_m: lowest and highest height of the surface above the ellipsoid: LOW,HIGH, metres; by
+            default the height range of the sensor models.
+        pairs: largest number of image pairs that are matched.
+        fill_cells: fill gaps from heights at most this many cells away; 0 leaves gaps open.
     """
 
     gsd_m: Annotated[float | None, typer.Option(min=0.01)] = None
@@ -67,9 +68,9 @@ def make(
 ) -> None:
     """Make the surface that overlapping registered scenes show: heights with their accuracy, on a map.
 
-    The file has four bands: height above the ellipsoid and its standard deviation in metres, number of
-    images, and a number for the reason why a cell has no height. A page beside it, with the ending html,
-    shows it. The models of the scenes have to agree: register them together first (--registered), or
+    The file has four bands: height above the ellipsoid and its standard deviation in metres, the number
+    of images, and a code for the reason if a cell has no height. A page with the ending html shows the
+    result. The models of the scenes must agree: register the scenes together first (--registered), or
     give the block that was made from them (--block).
     """
     with shown_progress() as progress:
@@ -94,7 +95,9 @@ def make(
 
 
 def points(
-    surface: Annotated[Path, typer.Argument(exists=True, help="As `amers surface make` writes it.")],
+    surface: Annotated[
+        Path, typer.Argument(exists=True, help="Surface, as `amers surface make` writes it.")
+    ],
     *,
     output: Annotated[Path, typer.Option("-o", "--output", help="LAZ or LAS file to write.")],
     max_sigma_m: Annotated[
@@ -105,8 +108,8 @@ def points(
 ) -> None:
     """Write the cells of a surface as a point cloud, for CloudCompare and QGIS.
 
-    Heights are above the ellipsoid, as the reference system in the file says. Every point has its
-    standard deviation (sigma_m) and the number of images that show it (views), 0 where it was filled.
+    Heights are above the ellipsoid, as the reference system in the file states. Every point has its
+    standard deviation (sigma_m) and the number of images that show it (views; 0 for a filled height).
     """
     with shown_progress() as progress:
         cloud = write_surface_points(surface, output, max_sigma_m=max_sigma_m, progress=progress)
@@ -114,21 +117,32 @@ def points(
 
 
 def difference(
-    earlier: Annotated[Path, typer.Argument(exists=True, help="As `amers surface make` writes it.")],
-    later: Annotated[Path, typer.Argument(exists=True, help="The same of another date.")],
+    earlier: Annotated[
+        Path, typer.Argument(exists=True, help="Surface, as `amers surface make` writes it.")
+    ],
+    later: Annotated[
+        Path,
+        typer.Argument(
+            exists=True, help="Surface of the later date, as `amers surface make` writes it."
+        ),
+    ],
     *,
     output: Annotated[Path, typer.Option("-o", "--output", help="GeoTIFF to write.")],
     align: Annotated[
-        bool, typer.Option(help="Move the later surface onto the earlier one, in position and height.")
+        bool,
+        typer.Option(
+            help="Shift the later surface onto the earlier one in position and height before "
+            "they are compared."
+        ),
     ] = True,
     as_json: AsJson = False,
 ) -> None:
     """Compare two surfaces: what rose and what sank, with its accuracy, on a map.
 
-    The file has three bands: height of the later above the earlier surface, its standard deviation, and
-    their ratio. A page beside it, with the ending html, shows it. The shift of the later surface by
-    which both agree on most ground is told; without it (--no-align), a common error of all heights is a
-    difference too.
+    The file has three bands: height of the later surface above the earlier one, the standard deviation
+    of this difference, and their ratio. A page with the ending html shows the result. The command
+    removes the shift of the later surface with which both agree on most of the ground, and prints it.
+    With --no-align, the shift stays, and a common error of all heights appears as a difference.
     """
     with shown_progress() as progress:
         found = write_surface_difference(earlier, later, output, align=align, progress=progress)

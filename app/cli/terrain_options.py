@@ -40,7 +40,7 @@ class NeededTerrain:
             STAC catalogue of them; path or address; repeat for several.
         geoid: grid file of the geoid, GTX or GeoTIFF.
         vertical: vertical datum of the heights: ellipsoid, EGM96, EGM2008, EPSG:…
-        fill_px: fill voids of the terrain from this many nodes away.
+        fill_px: fill voids of the terrain from heights at most this many nodes away.
     """
 
     dem: Places

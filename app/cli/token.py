@@ -12,7 +12,9 @@ from amers.app.usecases import tokens
 
 
 def create(
-    name: Annotated[str, typer.Argument(help="Name, for people; no other valid token has it.")],
+    name: Annotated[
+        str, typer.Argument(help="Name of the token; it must differ from the names of all valid tokens.")
+    ],
     *,
     scope: Annotated[
         list[str], typer.Option(help="read, register, monitor or admin; repeat for several scopes.")
@@ -22,14 +24,21 @@ def create(
     ] = None,
     storage_quota_bytes: Annotated[
         int | None,
-        typer.Option(help="Bytes that all its files may take; by default that of the settings."),
+        typer.Option(
+            help="Storage in bytes that all files of the token may occupy; by default the quota "
+            "of the settings."
+        ),
     ] = None,
     job_quota: Annotated[
-        int | None, typer.Option(help="Jobs that may be open at once; by default that of the settings.")
+        int | None,
+        typer.Option(
+            help="Number of jobs of the token that may wait or run at once; by default the "
+            "quota of the settings."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Create a token and print its secret, which is shown only now."""
+    """Create a token and print its secret, which is shown only once."""
     with transaction() as connection:
         new = tokens.create_token(
             connection,

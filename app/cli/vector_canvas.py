@@ -13,5 +13,5 @@ def canvas(
     *,
     output: Annotated[Path, typer.Option("-o", "--output", help="Virtual raster to write, .vrt.")],
 ) -> None:
-    """Write a view of a raw scene without its georeferencing, to draw on its pixels in QGIS."""
+    """Write a view of a raw scene without georeferencing, for drawing on its pixels in QGIS."""
     write_canvas(scene, output)

@@ -18,15 +18,17 @@ from amers.services.formats.vector.pixel_coordinates import PIXEL_ORIGINS, Pixel
 Vectors = Annotated[
     Path, typer.Argument(exists=True, help="GeoPackage, GeoJSON, shapefile or FlatGeobuf.")
 ]
-Output = Annotated[Path, typer.Option("-o", "--output", help="File to write; its suffix is the format.")]
+Output = Annotated[
+    Path, typer.Option("-o", "--output", help="Output file; its suffix selects the format.")
+]
 
 
-Layer = Annotated[str | None, typer.Option(help="Layer of the file; by default its only one.")]
+Layer = Annotated[str | None, typer.Option(help="Layer of the file; by default the only layer.")]
 Pixels = Annotated[
     str,
     typer.Option(
-        help="Pixel coordinates: qgis (x column, y minus row, from the corner), corner or centre of the "
-        "first pixel (y down)."
+        help="Pixel coordinates: qgis (x is column, y is minus row, from the corner of the "
+        "first pixel), or corner or centre (from this place of the first pixel, y downwards)."
     ),
 ]
 VertexFile = Annotated[
@@ -61,7 +63,7 @@ def correct(
     vertices: VertexFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Bring vectors that were digitised on a raw scene onto the map, with their predicted accuracy."""
+    """Transform vectors drawn on a raw scene to the map, with their predicted accuracy."""
     corrected = correct_file(
         VectorFile(vectors, layer),
         scene,
@@ -91,7 +93,7 @@ def project(
     vertices: VertexFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Bring vectors of the map into the pixel coordinates of a raw scene."""
+    """Transform vectors of the map to pixel coordinates of a raw scene."""
     projected = project_file(
         VectorFile(vectors, layer),
         scene,

@@ -6,7 +6,7 @@ from amers.app.worker.main import run_worker
 
 
 def worker() -> None:
-    """Do the jobs of the queue, one after the other, until Ctrl-C."""
+    """Run the jobs of the queue, one after another, until Ctrl-C."""
     settings = read_settings()
     logs.configure(settings)
     run_worker(settings)

@@ -26,8 +26,8 @@ class ExperimentOptions:
     """What is tried.
 
     Attributes:
-        draws: times that control points are drawn; the errors of all draws are taken together.
-        seed: of the draws.
+        draws: number of random draws of control points; the errors of all draws are combined.
+        seed: seed of the random draws; the same seed gives the same draws.
     """
 
     draws: int = 5

@@ -22,9 +22,10 @@ class GroundFiles:
     numbers.
 
     Attributes:
-        exclude: ground without points: GeoJSON polygons, or an image on a map; repeat for several.
-        land_cover: image of land cover classes: the typology of the points; water, snow and ice get
-            none.
+        exclude: ground where no points are made: GeoJSON polygons, or an image on a map that is not 0
+            there; repeat for several.
+        land_cover: image of land cover classes, which become the typology of the points; no points are
+            made on water, snow and ice.
     """
 
     exclude: tuple[Path, ...] = ()

@@ -34,17 +34,18 @@ class MarkedImages:
     """Marks in files, and the images that they are in.
 
     Attributes:
-        marks: points marked in images: CSV, ASP, OPF, GeoJSON, ODM, QGIS, ENVI, PCI; several files may
-            mark the same points, by their names. A CSV needs no coordinates of the ground.
-        images: image that marks name; repeat, two at least.
-        registered: folder with the registrations of the images, one folder each, as `amers scene
-            register-many -o` writes it.
-        block: folder of a block that was made from the images, whose adjusted models are used.
-        rigorous: use the rigorous models of images whose metadata have one, in place of their RPC: srp,
-            toutin or spot-hrv, the parameters that are free where they are adjusted.
+        marks: files of points marked in images: CSV, ASP, OPF, GeoJSON, ODM, QGIS, ENVI, PCI. Several
+            files may mark the same points, which have the same names. A CSV needs no ground coordinates.
+        images: image that is named in the marks; give at least two.
+        registered: output folder of `amers scene register-many`, with the registrations of the images.
+        block: folder of a block that was made from the images; the adjusted models of the block are
+            used.
+        rigorous: use the rigorous models of images whose metadata contain one, instead of their RPC. The
+            value is the set of parameters that an adjustment estimates: srp, toutin or spot-hrv.
         sigma_m: accuracy of a model that is not registered, one sigma, metres; for one of several images
-            IMAGE=M, repeat. By default that of the producer or the sensor.
-        mark_sigma_px: sigma of marks whose file states none, pixels; by default 0.5.
+            write IMAGE=M, and repeat the option. By default the accuracy that the producer states, or
+            that of the sensor.
+        mark_sigma_px: sigma of marks if their file states none, pixels; by default 0.5.
         models: of the images whose names and tags do not give them.
         stated: what the files of the marks do not state.
     """

@@ -19,14 +19,15 @@ class ModelChoice:
     """The models of images, where they are not those that their names and tags give.
 
     Attributes:
-        model: file of the model; for one of several images IMAGE=FILE, repeat. By default the first of
-            STEM.RPB, STEM.XML (WorldView), STEM_RPC.TXT, RPC_NAME.XML (DIMAP), STEM.rpc, tags of the
-            image, IMAGE.aux.xml, STEM_RPC.XML, STEM.geom, DIM_NAME.XML, METADATA.DIM, PHRDIMAP_NAME.XML,
-            as in GDAL; for JPEG 2000 IMAGE.aux.xml first, for NITF IMAGE.aux.xml, STEM_RPC.TXT and
-            RPC00B first.
-        crop_origin: LINE,SAMPLE of the image's first pixel in the image that the model is for; 0,0 where
-            they are the same; for one of several images IMAGE=LINE,SAMPLE, repeat. By default as stated
-            by ICHIPB, .TIL, DIMAP or the geotransform.
+        model: file of the sensor model; for one of several images write IMAGE=FILE, and repeat the
+            option. By default the first that exists of STEM.RPB, STEM.XML (WorldView), STEM_RPC.TXT,
+            RPC_NAME.XML (DIMAP), STEM.rpc, tags of the image, IMAGE.aux.xml, STEM_RPC.XML, STEM.geom,
+            DIM_NAME.XML, METADATA.DIM, PHRDIMAP_NAME.XML, as in GDAL. For JPEG 2000, IMAGE.aux.xml comes
+            first; for NITF, IMAGE.aux.xml, STEM_RPC.TXT and RPC00B come first.
+        crop_origin: position LINE,SAMPLE of the first pixel of the image in the full image of the sensor
+            model; 0,0 if the image is the full image. For one of several images write IMAGE=LINE,SAMPLE,
+            and repeat the option. By default the position that ICHIPB, .TIL, DIMAP or the geotransform
+            states.
     """
 
     model: tuple[str, ...] = ()

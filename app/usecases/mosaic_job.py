@@ -60,7 +60,8 @@ class MakeMosaic:
         bbox: west, south, east, north in degrees, the only ground wanted; by default all.
         level: change the grey values of the scenes so that they agree where they overlap.
         feather_px: width of the strip along a seam in which both scenes are blended, 0 to 512 pixels.
-        hide: leave out ground that other ground hides from a scene; other scenes fill it.
+        hide: do not use a scene where the ground is hidden from it by other ground; other scenes fill
+            this ground.
     """
 
     scenes: tuple[UUID, ...]

@@ -31,11 +31,11 @@ class MosaicFiles:
     """The files that a mosaic is made from.
 
     Attributes:
-        images: raw scenes or ortho-images, all with the same bands. What lies whole within those given
-            before is not shown.
-        registered: folder with the registrations of the images, one folder each, as `amers scene
-            register-many -o` writes it.
-        block: folder of a block that was made from the images, whose adjusted models are used.
+        images: raw scenes or ortho-images, all with the same bands. A scene that lies completely within
+            earlier scenes of this list is not shown.
+        registered: output folder of `amers scene register-many`, with the registrations of the images.
+        block: folder of a block that was made from the images; the adjusted models of the block are
+            used.
     """
 
     images: tuple[Path, ...]

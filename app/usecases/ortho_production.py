@@ -37,16 +37,17 @@ class OrthoFiles:
     """Ortho-images in files, and the heights of their ground.
 
     Attributes:
-        images: GeoTIFF (or COG) or JPEG 2000 on a map; several of one place, the most accurate first.
+        images: ortho-images, GeoTIFF (or COG) or JPEG 2000; several images of one place, the most
+            accurate first.
         terrain: heights of the ground; None takes `flat_m` everywhere.
         flat_m: height of flat ground above the ellipsoid, metres; replaces --dem.
-        height_sigma_m: sigma of the heights, metres; by default that of each cell of a surface, else
-            0.1 of the terrain's step.
-        sigma_m: accuracy of the images on the map, one sigma, metres; by default that of their
-            sensors.
-        frame_sigma_up_m: error that all the heights share, one sigma, metres; by default unknown.
+        height_sigma_m: sigma of the heights, metres; by default the sigma of each cell of a surface,
+            otherwise 0.1 of the grid spacing.
+        sigma_m: accuracy of the ortho-images on the map, one sigma, metres; by default the accuracy of
+            their sensors.
+        frame_sigma_up_m: common error of all heights, one sigma, metres; by default unknown.
         bands: bands to use: 2, or 1,2,3, or 3:0.3,2:0.7.
-        mask: image of the same ground; no points where it is not 0.
+        mask: image of the same ground, used as a mask: no points are made where it is not 0.
     """
 
     images: tuple[Path, ...]

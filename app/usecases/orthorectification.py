@@ -72,7 +72,7 @@ class OrthoMap:
 
     Attributes:
         crs: coordinate reference system of the map; by default the UTM zone.
-        gsd_m: ground sampling, metres; by default that of the scene.
+        gsd_m: pixel size of the map, metres; by default the ground sampling of the scene.
     """
 
     crs: str | None = None

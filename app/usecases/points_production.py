@@ -52,19 +52,22 @@ class KnownPointFiles:
     """Points of another base in a file, and the images or the folder that give them chips.
 
     Attributes:
-        points: points: GCPLib, Copernicus GCP database, CSV, ASP, OPF, GeoJSON, ODM, QGIS, ENVI, PCI.
-        images: image with a registered model, or on a map; repeat, the most accurate first.
-        chips: folder of the base's own chips, in place of images: GCPLib, Copernicus GCP database.
-        chip_origin: origin of the pixels of GCPLib's chips: centre, corner, centre-1, corner-1.
+        points: file of the points: GCPLib, Copernicus GCP database, CSV, ASP, OPF, GeoJSON, ODM, QGIS,
+            ENVI, PCI.
+        images: image with a registered model, or ortho-image; repeat for several, the most accurate
+            first.
+        chips: folder of the chips of the base, instead of images; for GCPLib and the Copernicus GCP
+            database.
+        chip_origin: pixel origin of the chips of GCPLib: centre, corner, centre-1, corner-1.
         stated: what the file of the points does not state.
         point_sigma_m: horizontal and up, one standard deviation, of points whose file states none.
         terrain: gives the heights of points without any.
-        height_sigma_m: sigma of the heights of --dem, metres; by default that of each cell of a
-            surface, else 0.1 of its step.
-        sigma_m: accuracy of the images' models, one sigma, metres; by default that of the producer or
-            the sensor.
-        frame_sigma_m: error that all points share, horizontal, one sigma, metres; by default unknown.
-        frame_sigma_up_m: the same of their heights.
+        height_sigma_m: sigma of the heights of --dem, metres; by default the sigma of each cell of a
+            surface, otherwise 0.1 of the grid spacing.
+        sigma_m: accuracy of the sensor models of the images, one sigma, metres; by default the accuracy
+            that the producer states, or that of the sensor.
+        frame_sigma_m: common horizontal error of all points, one sigma, metres; by default unknown.
+        frame_sigma_up_m: common vertical error of all points, one sigma, metres; by default unknown.
         bands: bands to use: 2, or 1,2,3, or 3:0.3,2:0.7.
         models: of the images whose names and tags do not give them.
     """

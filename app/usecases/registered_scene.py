@@ -32,11 +32,11 @@ class SceneModel:
 
     Attributes:
         image: raw image: GeoTIFF, JPEG 2000 or NITF.
-        model: file of the delivered model; by default found by its name.
-        registration: folder of the scene's registration (`amers scene register -o`).
+        model: file of the delivered model; by default it is found by its name.
+        registration: folder of the registration of the scene, the output of `amers scene register`.
         sigma_m: accuracy of a model that is not registered, one sigma, metres; by default unknown.
-        crop_origin: LINE,SAMPLE of the image's first pixel in the image that the model is for; by
-            default as stated by ICHIPB, .TIL, DIMAP or the geotransform.
+        crop_origin: position LINE,SAMPLE of the first pixel of the image in the full image of the sensor
+            model; by default the position that ICHIPB, .TIL, DIMAP or the geotransform states.
     """
 
     image: Path

@@ -47,10 +47,11 @@ class SurfaceFiles:
 
     Attributes:
         images: two or more images of the same ground.
-        registered: folder with the registrations of the images, one folder each, as `amers scene
-            register-many -o` writes it.
-        block: folder of a block that was made from the images, whose adjusted models are used.
-        water: what empty cells say: polygons in GeoJSON, or an image on a map, not 0 there; repeat.
+        registered: output folder of `amers scene register-many`, with the registrations of the images.
+        block: folder of a block that was made from the images; the adjusted models of the block are
+            used.
+        water: water, which is the stated reason for empty cells there: polygons in GeoJSON, or an image
+            on a map that is not 0 there; repeat for several.
     """
 
     images: tuple[Path, ...]

@@ -70,7 +70,7 @@ def write_surface_points(
     """Write every cell of a surface that has a height as a point, as LAZ or LAS.
 
     Args:
-        surface: as `amers surface make` writes it.
+        surface: surface, as `amers surface make` writes it.
         output: the file; an existing one is replaced.
         max_sigma_m: cells whose standard deviation is larger are left out; None takes all.
         progress: receives the fraction done and a message.

@@ -19,7 +19,7 @@ class TerrainFile:
             catalogue; see `read_dem`.
         vertical: vertical datum of the heights: ellipsoid, EGM96, EGM2008, EPSG:…
         geoid: grid file of the geoid, GTX or GeoTIFF.
-        fill_px: fill voids of the terrain from this many nodes away.
+        fill_px: fill voids of the terrain from heights at most this many nodes away.
         geoid_option: what gives `geoid`, for the error when the grid is missing.
         is_uploaded: the file comes from a stranger: only an image that names no other file is read.
     """

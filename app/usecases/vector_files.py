@@ -40,8 +40,9 @@ class VectorOptions:
 
     Attributes:
         pixels: origin and signs of the pixel coordinates, see `line_sample_of_xy`.
-        tolerance_px: add vertices where an edge bends by more, pixels.
-        skip_missed: leave out features that meet no ground, which are refused otherwise.
+        tolerance_px: add vertices where a transformed edge bends by more than this, pixels.
+        skip_missed: leave out features whose lines of sight do not meet the terrain; without this
+            option, they are an error.
     """
 
     pixels: PixelOrigin = "qgis"
@@ -54,10 +55,10 @@ class CorrectionOptions(VectorOptions):
     """How vectors of a raw image come onto the map.
 
     Attributes:
-        margin_px: vertices may lie this far outside the image, pixels.
+        margin_px: largest distance of a vertex outside the image, pixels.
         sigma_px: precision of the digitised vertices, one sigma, pixels.
-        height_sigma_m: accuracy of the heights, one sigma; by default that of each cell of a surface,
-            else 0.1 postings.
+        height_sigma_m: accuracy of the heights, one sigma, metres; by default the sigma of each cell of
+            a surface, otherwise 0.1 of the posting.
     """
 
     margin_px: float = 5.0
@@ -70,7 +71,7 @@ class ProjectionOptions(VectorOptions):
     """How vectors of the map come into a raw image.
 
     Attributes:
-        clip: cut at the border of the image.
+        clip: cut features at the border of the image.
     """
 
     clip: bool = False

@@ -34,7 +34,7 @@ class OrthoOptions:
     Attributes:
         kernel: "cubic" (convolution, a = -0.5) or "bilinear".
         tolerance_px: largest allowed error of the mapping, pixels.
-        hide: leave out ground that other ground hides from the sensor.
+        hide: write no data where the ground is hidden from the sensor by other ground.
         window_px: side of the windows of the map, pixels.
     """
 

@@ -56,15 +56,15 @@ class ProductionOptions:
 
     Attributes:
         fine_gsd_m, coarse_gsd_m: ground samplings of the chips, metres.
-        spacing_m: one point per square of this side, metres.
+        spacing_m: side of the squares that get one point each, metres.
         points: desired number of points; --spacing-m overrides it.
         candidates: number of tie points of every square that are tried.
-        min_views: least number of images that see a point.
+        min_views: smallest number of images that show a point.
         min_saliency: smallest saliency of a point's chip.
         max_sigma_m: largest horizontal standard deviation of a point within the block.
         max_sigma_up_m: largest vertical standard deviation of a point within the block.
-        surface_pairs: pairs of images at most that give the height of the surface at a point; 0 leaves
-            it unknown.
+        surface_pairs: largest number of image pairs from which the surface height at a point is
+            computed; 0 computes no surface heights.
         slope: a priori standard deviation of drift and skew of an image, pixels per pixel; the block
             corrects it by what it finds.
         features, block, refinement: of the stages.

@@ -57,7 +57,7 @@ class SelectionOptions:
     """What is asked of a selection of images.
 
     Attributes:
-        min_views: clear views that every place needs.
+        min_views: number of clear views that every place needs.
         cloud_limits_percent: cloud cover that images stay below: everywhere the first, where views are
             missing one after the other of the rest.
         max_snow_percent: largest snow cover of an image; images of unknown snow cover are taken.

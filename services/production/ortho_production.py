@@ -46,13 +46,13 @@ class OrthoPointOptions:
     Attributes:
         fine_gsd_m, coarse_gsd_m: ground samplings of the chips, metres; by default that of the image in
             two digits, and four times that.
-        spacing_m: one point per square of this side, metres.
+        spacing_m: side of the squares that get one point each, metres.
         points: desired number of points; --spacing-m overrides it.
         candidates: number of corners of every square that are tried.
         min_saliency: smallest saliency of a point's chip.
         local_sigma_px: position of a detail relative to the rest of the image, pixels of the image, one
             standard deviation a coordinate; several images raise it when they disagree by more.
-        min_views: least number of images in which a point is found, of those showing it.
+        min_views: smallest number of images in which a point must be found.
         min_share: least share of the images showing a point in which it is found, 0 to 1.
     """
 

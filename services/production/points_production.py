@@ -51,7 +51,7 @@ class KnownPointOptions:
         fine_gsd_m, coarse_gsd_m: ground samplings of the chips, metres; by default that of the coarsest
             image in two digits, and four times that.
         min_saliency: smallest saliency of a point's chip.
-        min_views: least number of images in which a point is found, of those showing it.
+        min_views: smallest number of images in which a point must be found.
         local_sigma_px: position of a detail relative to the rest of its image, pixels of the image, one
             standard deviation a coordinate; several images raise it when they disagree by more.
     """

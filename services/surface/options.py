@@ -19,7 +19,7 @@ class SurfaceOptions:
             the models are meant for.
         pairs: number of pairs at most.
         bases: least and largest base over height of a pair.
-        fill_cells: gaps are filled from heights at most this many cells away.
+        fill_cells: fill gaps from heights at most this many cells away; 0 leaves gaps open.
         matcher: finds the disparities.
     """
 

@@ -130,7 +130,7 @@ class Around:
     """The cells that count around one.
 
     Attributes:
-        fill_cells: gaps are filled from heights at most this many cells away.
+        fill_cells: fill gaps from heights at most this many cells away; 0 leaves gaps open.
         rough_cells: side of the square whose roughness counts, an odd number.
     """
 

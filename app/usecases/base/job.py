@@ -36,11 +36,11 @@ class MakeBase:
         archive: whose images are used.
         version, title: of the block.
         since: leave out images before this day, UTC: YYYY-MM-DD.
-        dates: clear dates that every place needs, over seasons and orbits.
-        spacing_m: one point per square of this side, metres; by default a hundred pixels, less in a
-            small region.
-        max_cloud: largest cloud cover of an image in its catalogue, percent.
-        min_clear: least clear share of an image in the region, by its mask, percent.
+        dates: number of clear dates that every place needs, distributed over seasons and orbits.
+        spacing_m: side of the squares that get one point each, metres; by default a hundred pixels, less
+            in a small region.
+        max_cloud: largest cloud cover of an image according to its catalogue, percent.
+        min_clear: smallest clear share of an image in the region according to its mask, percent.
         dem: heights of the ground, a path below AMERS_REFERENCE_FOLDER; by default the Copernicus DEM of
             the catalogues.
         vertical: vertical datum of these heights, where the file does not state it.

@@ -52,15 +52,15 @@ class BaseOptions:
     """How a base is made.
 
     Attributes:
-        dates: clear dates that every place needs, over seasons and orbits.
-        spacing_m: one point per square of this side, metres; by default a hundred pixels, less in a
-            small region.
-        min_share: least share of the dates showing a point in which it is found, 0 to 1.
-        max_cloud: largest cloud cover of an image in its catalogue, percent.
-        min_clear: least clear share of an image in the region, by its mask, percent.
-        height_sigma_m: sigma of the heights, metres; by default that of the terrain.
-        frame_sigma_up_m: error that all the heights share, one sigma, metres; by default that of the
-            Copernicus DEM, else unknown.
+        dates: number of clear dates that every place needs, distributed over seasons and orbits.
+        spacing_m: side of the squares that get one point each, metres; by default a hundred pixels, less
+            in a small region.
+        min_share: smallest share of the dates showing a point in which the point is found, 0 to 1.
+        max_cloud: largest cloud cover of an image according to its catalogue, percent.
+        min_clear: smallest clear share of an image in the region according to its mask, percent.
+        height_sigma_m: sigma of the heights, metres; by default the sigma of the terrain.
+        frame_sigma_up_m: common error of all heights, one sigma, metres; by default the common error of
+            the Copernicus DEM, otherwise unknown.
     """
 
     dates: int = 8

@@ -84,10 +84,13 @@ class QualityReferences:
     Attributes:
         heights: None compares no heights.
         sites: places with ortho-images.
-        site_sigma_m: accuracy of these images, one sigma a coordinate, metres.
-        reach_m: largest shift searched at sites; by default 3 sigma of what is declared.
-        images: image of the block (folders only), to be compared with the sites; repeat.
-        excluded: ground without points, such as water: GeoJSON, or image other than 0; repeat.
+        site_sigma_m: accuracy of the reference ortho-images, one sigma per coordinate, metres.
+        reach_m: largest shift that is searched at the reference images, metres; by default 3 times the
+            declared sigma.
+        images: image of the block to compare with the reference images; only for a block folder; repeat
+            for several.
+        excluded: ground where no points are expected, such as water: GeoJSON, or an image that is not 0
+            there; repeat for several.
     """
 
     heights: HeightFiles | None = None
@@ -103,11 +106,12 @@ class RequiredQuality:
     """Requirements that replace those that the block itself specifies.
 
     Attributes:
-        points_per_km2: required density; by default that of the block.
+        points_per_km2: required points per square kilometre; by default the density that the block
+            specifies.
         min_share: share of the ground, by cells, that shall reach the density, 0 to 1.
-        min_views: required images of a point; by default as specified.
-        ce90_m: required CE90 on the Earth, metres.
-        le90_m: required LE90 on the Earth, metres.
+        min_views: required number of images that show a point; by default as the block specifies.
+        ce90_m: largest allowed CE90 on the Earth, metres.
+        le90_m: largest allowed LE90 on the Earth, metres.
     """
 
     points_per_km2: float | None = None

@@ -68,7 +68,7 @@ class RegisterScene:
             sigma); by default one pixel.
         control_frame_sigma_m: error on the Earth that all this ground shares: horizontal and up, metres
             (1 sigma); by default unknown.
-        control_mark_sigma_px: sigma of marks whose file states none, pixels; by default 0.5.
+        control_mark_sigma_px: sigma of marks if their file states none, pixels; by default 0.5.
         crop_origin: LINE,SAMPLE of the image's first pixel in the image that the model is for; by
             default as its files state it.
         copy_image: whether a GeoTIFF is copied to the outputs with the refined model in its tags.

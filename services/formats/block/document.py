@@ -20,7 +20,7 @@ class BlockSpecification:
 
     Attributes:
         gsds_m: ground sampling distances of the chips in metres, finest first.
-        min_views: least number of images that see a point.
+        min_views: smallest number of images that show a point.
         points_per_km2: intended density, None when not stated.
     """
 
