@@ -3,7 +3,7 @@
 from amers.services.formats import ground_masks
 from amers.services.formats.elevation.rows import TERRAIN_READERS
 from amers.services.formats.gcp.rows import POINT_READERS
-from amers.services.formats.images import georeference, pixel_rows, scenes
+from amers.services.formats.images import georeference, pixel_rows, scene_rows
 from amers.services.formats.reader_rows import Reader
 from amers.services.formats.sensor_models import (
     dimap,
@@ -18,7 +18,7 @@ from amers.services.formats.vector import map_layers
 
 READERS: tuple[Reader, ...] = (
     *POINT_READERS,
-    scenes.READER,
+    scene_rows.READER,
     pixel_rows.READER,
     pixel_rows.MASK_READER,
     rpc_text.RPC_TEXT_READER,

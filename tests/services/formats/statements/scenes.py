@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from rasterio.control import GroundControlPoint
 
-from amers.services.formats.images import scenes
+from amers.services.formats.images import scene_rows
 from amers.services.formats.images.scenes import read_scene
 from amers.services.formats.sensor_models import product_documents
 from amers.services.formats.sensor_models.rpc_files import read_rpc
@@ -31,7 +31,7 @@ from tests.services.formats.statements.scene_files import (
     write_image,
 )
 
-SCENE, PRODUCT = scenes.READER.name, product_documents.READER.name
+SCENE, PRODUCT = scene_rows.READER.name, product_documents.READER.name
 OTHER = part(9003.0, 15004.0)
 
 
