@@ -30,17 +30,17 @@ class HasModel(Protocol):
 
     @property
     def model(self) -> SensorModel:
-        """From ground to image."""
+        """The model that transforms ground positions to image positions."""
         ...
 
 
 @dataclass(frozen=True, repr=False)
 class TiePoints:
-    """k details that two images show.
+    """Tie points: k details that two images show.
 
     Attributes:
-        first, second: (k, 2) line and sample in both images, pixels.
-        similarity: (k,) of the details, 1 when they look the same.
+        first, second: (k, 2) line and sample in the first and in the second image, pixels.
+        similarity: (k,) similarity of each detail in both images; 1 means equal.
     """
 
     first: Array
@@ -61,15 +61,15 @@ class TiePoints:
 
 
 def project(scene: HasModel | FilePath, lon_lat_h: ArrayLike) -> Array:
-    """Where an image shows ground.
+    """Compute the image positions of ground positions.
 
     Args:
-        scene: a scene, its path, or what `register` or `refine` returned: then with the refined model.
+        scene: a scene, its path, or a result of `register` or `refine`, whose refined model is used.
         lon_lat_h: (3,) or (n, 3) longitude, latitude, height; degrees, metres above the ellipsoid.
 
     Returns:
         (2,) or (n, 2) line and sample, pixels; (0, 0) is the centre of the first pixel. NaN where the
-        model is not valid. Positions may lie outside the image.
+        model is not valid. Positions can be outside the image.
 
     Raises:
         InputError: a latitude is beyond 90 degrees, or the shape is wrong.
@@ -85,22 +85,25 @@ def locate(
     *,
     terrain: Terrain | FilePath | None = None,
 ) -> Array:
-    """What ground an image shows: at a height, or where the line of sight first meets a terrain.
+    """Compute the ground positions of image positions, at a height or on a terrain.
+
+    On a terrain, the ground position is where the line of sight first meets the terrain.
 
     Args:
-        scene: a scene, its path, or what `register` or `refine` returned: then with the refined model.
+        scene: a scene, its path, or a result of `register` or `refine`, whose refined model is used.
         line_sample: (2,) or (n, 2) pixels; (0, 0) is the centre of the first pixel.
-        height_m: one height or (n,) heights above the ellipsoid, metres. By default none: give a height
-            or a terrain.
-        terrain: an open terrain, or the path of one that states its vertical datum. By default none.
+        height_m: one height or (n,) heights above the ellipsoid, metres. By default none: then a terrain
+            is required.
+        terrain: an open terrain, or the path of a file that states its vertical datum. By default none:
+            then a height is required.
 
     Returns:
-        (3,) or (n, 3) longitude, latitude, height. NaN where the model is not valid, or the line of
-        sight meets no ground.
+        (3,) or (n, 3) longitude, latitude, height. NaN where the model is not valid, or where the line
+        of sight does not meet the terrain.
 
     Raises:
-        InputError: not one of height and terrain is given, the shape is wrong, or no line of sight comes
-            near the terrain.
+        InputError: height and terrain are both given or both missing, the shape is wrong, or no line of
+            sight comes near the terrain.
     """
     rows = rows_of(line_sample, "line_sample", (2,))
     if (height_m is None) == (terrain is None):
@@ -126,15 +129,15 @@ def match_images(
     max_ratio: float = 0.75,
     tolerance_px: float = 1.5,
 ) -> TiePoints:
-    """Details that two overlapping images show, matched with the help of their sensor models.
+    """Find details that two overlapping images show, with the help of their sensor models.
 
     Args:
         first, second: scenes or their paths.
-        gsd_m: ground sampling in which details are compared, metres. By default that of the coarser
-            image; a larger one is faster, and finds fewer.
+        gsd_m: ground sampling at which details are compared, metres. By default the ground sampling of
+            the coarser image; a larger value is faster and finds fewer details.
         max_ratio: largest ratio of the distances to the best and to the second best candidate. By
-            default 0.75; a smaller one keeps fewer and surer details.
-        tolerance_px: largest distance from the common offset of the two images across the epipolar
+            default 0.75; a smaller value gives fewer and more reliable details.
+        tolerance_px: largest deviation from the common offset of the two images, across the epipolar
             lines, pixels of `gsd_m`. By default 1.5.
 
     Raises:

@@ -32,8 +32,8 @@ class Scene:
     """An image with its sensor model. It is read by windows, and closed as a context or by `close`.
 
     Attributes:
-        files: that it was opened from, with what was stated of them.
-        content: image, model, acquisition and accuracy, as the modules of `amers.services` take them.
+        files: files of the scene, with the statements of the caller about them.
+        content: image, model, acquisition and accuracy, as the modules of `amers.services` use them.
     """
 
     files: SceneFiles
@@ -81,7 +81,7 @@ class Scene:
 
     @property
     def statements(self) -> Statements:
-        """What its files state, and what became of each statement: used, assumed or not used."""
+        """Statements of the files, with the treatment of each: used, assumed or not used."""
         return self.content.statements
 
     def close(self) -> None:
@@ -91,11 +91,11 @@ class Scene:
 
 @dataclass(frozen=True, repr=False)
 class Block:
-    """Control points with chips: small image patches that show what the place of a point looks like.
+    """Control points with chips: small image patches of the places of the points.
 
     Attributes:
-        folder: of the block.
-        metadata: what the block states of itself.
+        folder: folder of the block.
+        metadata: identity, licence and accuracy that the block states.
         points: the n points, as arrays with n rows: `points.id`, `points.lon_lat_h`, and more.
     """
 
@@ -131,8 +131,8 @@ class Terrain:
     """Heights of the ground.
 
     Attributes:
-        file: that it was opened from, with what was stated of it.
-        grid: as the modules of `amers.services` take it.
+        file: file of the terrain, with the statements of the caller about it.
+        grid: grid of heights, as the modules of `amers.services` use it.
     """
 
     file: TerrainFile
@@ -148,7 +148,7 @@ class Terrain:
 
     @property
     def statements(self) -> Statements:
-        """What its files state, and what became of each statement: used, assumed or not used."""
+        """Statements of the files, with the treatment of each: used, assumed or not used."""
         return self.grid.statements
 
     def height_m(self, lon_lat: ArrayLike) -> Array:
@@ -180,16 +180,18 @@ def open_scene(
 
     Args:
         image: GeoTIFF, JPEG 2000 or NITF; or a product in tiles: its `DIM_….XML`, `.TIL` or folder.
-        model: file of its model. By default it is in the image, or beside it under the name that its
-            format gives it.
-        sigma_m: horizontal accuracy of the model, one standard deviation of each coordinate, metres. A
-            registration searches up to three times as far. By default the figure of the producer, else
-            that of the sensor, else 50 m; an ortho-image of an unknown sensor needs it.
-        bands: numbers of the bands to use with their weights, such as "1" or "1,2,3". By default the
-            panchromatic band, or the mean of the visible bands.
-        mask: image of the same ground; pixels are not used where it is not zero. By default all are.
-        crop_origin: line and sample of the image's first pixel in the image that the model is for. By
-            default as the files state it.
+        model: file of the sensor model. By default the model in the image, or in a file next to the
+            image with the name that its format defines.
+        sigma_m: horizontal accuracy of the model, one standard deviation per coordinate, metres. A
+            registration searches up to three times this distance. By default the accuracy that the
+            producer states, otherwise that of the sensor, otherwise 50 m; an ortho-image of an unknown
+            sensor needs a value.
+        bands: numbers of the bands to use, with optional weights, such as "1", "1,2,3" or "3:0.3,2:0.7".
+            By default the panchromatic band, or the mean of the visible bands.
+        mask: image of the same ground; pixels of the scene are ignored where it is not 0. By default no
+            pixel is masked.
+        crop_origin: line and sample of the first pixel of the image in the full image of the sensor
+            model. By default the position that the files state.
 
     Raises:
         InputError: the image, its model or its mask cannot be used.
@@ -235,11 +237,11 @@ def open_terrain(
 
     Args:
         dem: GeoTIFF (or COG), JPEG 2000 or NITF on a map: a path or an address, or several tiles; also a
-            folder, an archive, a list or a STAC catalogue of them.
-        vertical: vertical datum of the heights where the file does not state it: "ellipsoid", "EGM96",
-            "EGM2008" or the code of a vertical reference system. By default the file has to state it.
-        geoid: grid file of the geoid. By default the grid that PROJ has installed.
-        fill_px: voids are filled from heights at most this many nodes away. By default 0: voids stay.
+            folder, an archive, a list or a STAC catalogue of tiles.
+        vertical: vertical datum of the heights if the file does not state it: "ellipsoid", "EGM96",
+            "EGM2008" or the code of a vertical reference system. By default the file must state it.
+        geoid: grid file of the geoid. By default the installed grid of PROJ.
+        fill_px: fill voids from heights at most this many nodes away. By default 0: voids stay.
 
     Raises:
         InputError: the file cannot be used, or its vertical datum is unknown.

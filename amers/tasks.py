@@ -84,9 +84,9 @@ class JointRegistration:
     """Scenes registered together.
 
     Attributes:
-        registrations: of the scenes that fit, by the names of their images without suffix.
-        failed: why others were not registered, by the same names.
-        report: on all of them.
+        registrations: registration of each scene that fits, by the name of its image without suffix.
+        failed: error of each scene that was not registered, by the name of its image without suffix.
+        report: report on all scenes.
     """
 
     registrations: dict[str, Registration]
@@ -117,18 +117,18 @@ def refine(
     Args:
         scene: the scene or its path.
         marks: file of marked points in any format that Amers reads (GeoJSON, CSV, QGIS, ASP, ENVI, ODM,
-            OPF, PCI); points that are switched off or are check points are not used. Or a pair: ground
-            positions (n, 3) of longitude, latitude, height above the ellipsoid, and where the image
-            shows them, (n, 2) line and sample.
-        folder: for files with the refined model. By default none are written.
-        heights: vertical datum of the heights of a file that does not state it; see `open_terrain`. By
-            default the file has to state it.
-        sigma_px: precision of marks that come without one, one standard deviation of each coordinate,
+            OPF, PCI); check points and points that are switched off are not used. Or a pair of arrays:
+            ground positions (n, 3) as longitude, latitude, height above the ellipsoid, and their image
+            positions (n, 2) as line and sample.
+        folder: output folder for files with the refined model. By default no files are written.
+        heights: vertical datum of the heights if the file does not state it; see `open_terrain`. By
+            default the file must state it.
+        sigma_px: precision of marks if the file states none, one standard deviation per coordinate,
             pixels. By default 0.5.
-        order: of a correction by least squares alone: "shift" needs two marks, "drift" three, "affine"
-            four, one more than determine it. By default None: the marks are weighed against the accuracy
-            of the model, as by `register` with `control`: one mark is enough, and wrong ones are
-            rejected.
+        order: order of a correction that least squares alone determine: "shift" needs two marks, "drift"
+            three, "affine" four, which is one more than the minimum. By default None: the marks are
+            weighted against the accuracy of the model, as by `register` with `control`. One mark is then
+            enough, and wrong marks are rejected.
 
     Raises:
         InputError: a file cannot be used, or a latitude is beyond 90 degrees.
@@ -169,29 +169,32 @@ def register(  # noqa: PLR0913 - options by keyword, as those of the command
     Args:
         scene: the scene or its path.
         block: the block or its folder. By default none: the scene is registered on marks alone.
-        folder: for the refined model, the report and the residuals; an older result in it is replaced as
-            a whole, and a failure leaves the folder as it is. By default nothing is written.
+        folder: output folder for the refined model, the report and the residuals. A result replaces an
+            older result in the folder as a whole; a failure leaves the folder unchanged. By default
+            nothing is written.
         control: file of ground points that you marked in the image, in any format that `refine` reads,
-            or several; one mark is enough, and check points in it are held out. By default none.
-        control_heights: vertical datum of these heights, as `heights` of `refine`. By default the file
-            has to state it.
-        control_sigma_m: horizontal and vertical standard deviation of this ground where its file states
-            none, metres. By default one pixel.
-        control_frame_sigma_m: horizontal and vertical standard deviation of the error on the Earth that
-            all this ground shares, metres. By default it is unknown.
-        check_points: file of marked points that are held out, and lower the verdict when the result
-            contradicts them; needs a folder. By default none.
-        max_points: largest number of points that are tried, well spread over the image; more take
-            longer. By default 500; 0 tries all.
-        max_ce90_on_earth_m: a result whose CE90 on the Earth is larger is "failed", metres. By default
-            there is no limit.
+            or several files. One mark is enough; check points in the file take no part in the
+            adjustment. By default none.
+        control_heights: vertical datum of the heights of `control`, as `heights` of `refine`. By default
+            the file must state it.
+        control_sigma_m: horizontal and vertical standard deviation of the ground points of `control` if
+            the file states none, metres. By default one pixel.
+        control_frame_sigma_m: horizontal and vertical standard deviation of the common error of all
+            ground points of `control` on the Earth, metres. By default it is unknown.
+        check_points: file of marked points that take no part in the adjustment. They lower the verdict
+            if the result contradicts them; needs a folder. By default none.
+        max_points: largest number of points that are tried, well distributed over the image; more points
+            take longer. By default 500; 0 tries all.
+        max_ce90_on_earth_m: largest allowed CE90 on the Earth, metres; a result with a larger value is
+            "failed". By default there is no limit.
         copy_image: also write a copy of a GeoTIFF with the refined model in its tags; needs a folder. By
-            default not.
-        progress: receives the fraction done and a message. By default nothing does.
+            default no copy is written.
+        progress: function that receives the completed fraction and a message. By default none.
 
     Returns:
-        With `model`, with the verdict, the criteria and the accuracy in `qualification`, and with what
-        became of each mark, and where one more would help most, in `marks`.
+        The registration. `model` is the refined model. `qualification` contains the verdict, the
+        criteria and the accuracy. `marks` contains the result of each mark, and the place where one more
+        mark would help most.
 
     Raises:
         InputError: the scene, the block, the marks or the folder cannot be used.
@@ -235,14 +238,14 @@ def register_on_reference(
     Args:
         scene: the scene or its path.
         reference: ortho-image on a map: a path or an address, or several pieces of it; also a folder, an
-            archive, a list or a STAC catalogue of them.
-        terrain: heights of the same ground, open or the path of a file that states its vertical datum.
-            None only for a scene that is an ortho-image, which heights do not move.
+            archive, a list or a STAC catalogue of pieces.
+        terrain: heights of the same ground: an open terrain, or the path of a file that states its
+            vertical datum. None only if the scene is an ortho-image, because heights do not displace it.
         folder, check_points, max_ce90_on_earth_m, copy_image, progress: as for `register`, with the same
             defaults.
 
     Returns:
-        As `register`; its points are the places that were matched.
+        The registration, as for `register`; its points are the matched places.
 
     Raises:
         InputError: the scene, the reference or the folder cannot be used.
@@ -273,18 +276,19 @@ def register_together(
     jobs: int = 1,
     progress: Progress = no_progress,
 ) -> JointRegistration:
-    """Refine the models of overlapping scenes in one adjustment, held together by tie points.
+    """Refine the models of overlapping scenes in one adjustment, connected by tie points.
 
     A scene that cannot be read or does not fit is left out, and does not stop the others.
 
     Args:
         scenes: scenes or their paths.
         block: the block or its folder.
-        folder: gets a folder for each scene, named by its image, and one named "block" with the report
-            on all; older results in them are replaced.
-        copy_image: also write copies of GeoTIFFs with the refined models in their tags. By default not.
-        jobs: processes that search at once. By default 1: this process.
-        progress: receives the fraction done and a message. By default nothing does.
+        folder: output folder. It gets a folder for each scene, named by its image, and a folder "block"
+            with the report on all scenes; older results in these folders are replaced.
+        copy_image: also write copies of GeoTIFFs with the refined models in their tags. By default no
+            copies are written.
+        jobs: number of processes that search at the same time. By default 1: this process.
+        progress: function that receives the completed fraction and a message. By default none.
 
     Raises:
         InputError: no scene can be used, or a folder cannot be replaced.
@@ -324,20 +328,21 @@ def produce_points(
 ) -> Block:
     """Make a block of control points from overlapping images.
 
-    A report on the adjustment of the images is written into FOLDER.adjustment. When the same production
-    was interrupted, it goes on from where it was.
+    A report on the adjustment of the images is written into FOLDER.adjustment. A production that was
+    interrupted continues when it is called again with the same arguments.
 
     Args:
-        images: two or more, with their models inside or beside them.
-        folder: of the block, which gets its name; must not exist.
-        gsds_m: two ground samplings of the chips, finest first, metres: that of the scenes to register,
-            and one that is about ten times coarser, for models that are far off. By default 2 and 20.
-        points: number of points aimed at. By default 300.
-        sigma_m: accuracy of the models, one standard deviation of each coordinate, metres. By default
-            the figure of the producer, else that of the sensor, else 50 m.
-        licence: of points and chips, an SPDX identifier. By default "proprietary".
-        jobs: processes at once. By default 1: this process.
-        progress: receives the fraction done and a message. By default nothing does.
+        images: two or more images, with their models inside or next to them.
+        folder: folder of the block, which gets the name of the folder; it must not exist.
+        gsds_m: two ground samplings of the chips, the finer one first, metres: the ground sampling of
+            the scenes to register, and one that is about ten times coarser, for models with large
+            errors. By default 2 and 20.
+        points: desired number of points. By default 300.
+        sigma_m: accuracy of the models, one standard deviation per coordinate, metres. By default the
+            accuracy that the producer states, otherwise that of the sensor, otherwise 50 m.
+        licence: licence of points and chips, an SPDX identifier. By default "proprietary".
+        jobs: number of processes. By default 1: this process.
+        progress: function that receives the completed fraction and a message. By default none.
 
     Returns:
         The block that was written.
@@ -373,15 +378,15 @@ def orthorectify(
 
     Args:
         scene: the scene or its path.
-        terrain: the terrain, or the path of one that states its vertical datum.
+        terrain: an open terrain, or the path of a file that states its vertical datum.
         output: path of the ortho-image; an existing file is replaced.
         crs: reference system of the map, such as "EPSG:32631". By default the UTM zone of the scene.
-        gsd_m: ground sampling of the map, metres. By default that of the scene.
-        hide: write nodata for ground that other ground hides from the sensor. By default it shows what
-            hides it.
-        registration: folder of the results of `register`, whose model is used. By default that of the
-            scene, such as one opened with `model=` and the file of a refined model.
-        progress: receives the fraction done and a message. By default nothing does.
+        gsd_m: pixel size of the map, metres. By default the ground sampling of the scene.
+        hide: write nodata where the ground is hidden from the sensor by other ground. By default the map
+            shows the hiding ground there.
+        registration: output folder of `register`, whose refined model is used. By default the model of
+            the scene, for example of a scene opened with `model=` and the file of a refined model.
+        progress: function that receives the completed fraction and a message. By default none.
 
     Raises:
         InputError: the scene or the terrain cannot be used.
@@ -406,16 +411,17 @@ def straighten(
     *,
     progress: Progress = no_progress,
 ) -> StraightenedScene:
-    """Write a scene resampled by the motion of its lines and samples, so that an RPC carries its model.
+    """Resample a scene with displaced lines or samples, so that an RPC expresses its model.
 
     Args:
-        scene: as delivered: the scene or its path.
-        registration: folder of the results of `register`, which found the motion.
+        scene: the delivered scene or its path.
+        registration: output folder of `register`, which measured the displacements.
         output: path of the GeoTIFF; an existing file is replaced.
-        progress: receives the fraction done and a message. By default nothing does.
+        progress: function that receives the completed fraction and a message. By default none.
 
     Raises:
-        InputError: the scene or its registration cannot be used, or its correction is affine.
+        InputError: the scene or its registration cannot be used, or the correction is affine, so that
+            nothing has to be straightened.
     """
     files = _files_of(scene)
     source = ImageFiles(files.image, files.model, files.crop_origin)
@@ -436,20 +442,20 @@ def surface(
     """Write the surface that overlapping scenes show: heights on a map, with their accuracy.
 
     The bands are the height above the ellipsoid and its standard deviation in metres, the number of
-    images, and a number for the reason why a cell has no height. An interrupted surface goes on from
-    where it was.
+    images, and a code for the reason if a cell has no height. An interrupted surface continues when it
+    is called again with the same arguments.
 
     Args:
-        scenes: two or more, whose models agree: scenes or their paths.
+        scenes: two or more scenes or their paths; their models must agree.
         output: path of the GeoTIFF; an existing file is replaced.
-        registered: folder of the results of `register_together`, whose models are used. By default
-            those of the scenes, such as scenes opened with the adjusted models of a block.
+        registered: output folder of `register_together`, whose refined models are used. By default the
+            models of the scenes, for example of scenes opened with the adjusted models of a block.
         gsd_m: side of a cell, metres. By default the ground sampling of the finest scene.
-        heights_m: lowest and highest surface above the ellipsoid, metres. By default the heights that
-            the models are meant for; a narrower range is faster.
-        pairs: largest number of pairs of scenes that show a place. By default 10.
-        jobs: processes at once. By default 1: this process.
-        progress: receives the fraction done and a message. By default nothing does.
+        heights_m: lowest and highest height of the surface above the ellipsoid, metres. By default the
+            height range of the models; a narrower range is faster.
+        pairs: largest number of scene pairs that are matched. By default 10.
+        jobs: number of processes. By default 1: this process.
+        progress: function that receives the completed fraction and a message. By default none.
 
     Raises:
         InputError: a scene cannot be used.
@@ -480,22 +486,23 @@ def mosaic(
 ) -> MosaicFile:
     """Write one ortho-image of many scenes, cut where they agree best, and measure the steps at seams.
 
-    Beside the output, NAME.sources.tif has the number of the scene of each pixel, and NAME.seams.gpkg
-    the ground that each scene shows. An interrupted mosaic goes on from where it was.
+    Next to the output, NAME.sources.tif contains the scene number of each pixel, and NAME.seams.gpkg the
+    ground that each scene shows. An interrupted mosaic continues when it is called again with the same
+    arguments.
 
     Args:
-        scenes: with the same bands: scenes or their paths. What lies whole within those given before is
-            not shown.
+        scenes: scenes or their paths, all with the same bands. A scene that lies completely within
+            earlier scenes of this list is not shown.
         output: path of the GeoTIFF; an existing file is replaced.
-        terrain: heights of the ground, or a surface: open, or the path of a file that states its
-            vertical datum. By default none, which only images on a map allow.
-        registered: folder of the results of `register_together`, whose models are used. By default
-            those of the scenes.
-        gsd_m: ground sampling of the map, metres. By default that of the finest scene.
-        level: change the grey values of the scenes so that they agree where they overlap. By default
-            not.
-        jobs: processes at once. By default 1: this process.
-        progress: receives the fraction done and a message. By default nothing does.
+        terrain: heights of the ground, or a surface: an open terrain, or the path of a file that states
+            its vertical datum. By default none, which is possible only if all scenes are ortho-images.
+        registered: output folder of `register_together`, whose refined models are used. By default the
+            models of the scenes.
+        gsd_m: pixel size of the map, metres. By default the ground sampling of the finest scene.
+        level: change the grey values of the scenes so that they agree where the scenes overlap. By
+            default the grey values stay unchanged.
+        jobs: number of processes. By default 1: this process.
+        progress: function that receives the completed fraction and a message. By default none.
 
     Raises:
         InputError: a file cannot be used, or the scenes have different bands.
@@ -528,24 +535,26 @@ def correct_vectors(
     pixels: PixelOrigin = "qgis",
     sigma_px: float = 0.5,
 ) -> CorrectedFile:
-    """Bring vectors that were digitised on a raw scene onto the map, with their predicted accuracy.
+    """Transform vectors drawn on a raw scene to the map, with their predicted accuracy.
 
     Args:
         vectors: GeoPackage, GeoJSON, shapefile or FlatGeobuf with one layer, in pixel coordinates of the
             scene.
         scene: the scene or its path.
-        terrain: the terrain, or the path of one that states its vertical datum.
-        output: file to write; its suffix is the format. An existing file is replaced.
-        registration: folder of the results of `register`; its refined model is used. By default none:
-            the model as delivered.
-        crs: reference system of the map. By default the UTM zone of the scene, EPSG:4326 in GeoJSON.
-        pixels: "qgis" (x column, y minus row, from the corner of the first pixel), or "corner" or
-            "centre" of the first pixel with y down. By default "qgis".
-        sigma_px: precision of the digitised vertices, one standard deviation of each coordinate, pixels;
-            it enters the predicted accuracy. By default 0.5.
+        terrain: an open terrain, or the path of a file that states its vertical datum.
+        output: output file; its suffix selects the format. An existing file is replaced.
+        registration: output folder of `register`, whose refined model is used. By default none: the
+            delivered model is used.
+        crs: reference system of the map. By default the UTM zone of the scene, or EPSG:4326 for GeoJSON.
+        pixels: pixel coordinates of the vectors: "qgis" (x is column, y is minus row, from the corner of
+            the first pixel), or "corner" or "centre" (from this place of the first pixel, y downwards).
+            By default "qgis".
+        sigma_px: precision of the drawn vertices, one standard deviation per coordinate, pixels; it is
+            part of the predicted accuracy. By default 0.5.
 
     Raises:
-        InputError: a file cannot be used, or a vertex lies outside the image or meets no ground.
+        InputError: a file cannot be used, or a vertex is outside the image, or its line of sight does
+            not meet the terrain.
     """
     files = _files_of(scene)
     of_registration = None if registration is None else Path(registration)
