@@ -31,19 +31,22 @@ AREA_KM2 = func.least(density_cell.c.outline_km2, density_cell.c.cell_km2, type_
 DENSITY = Collection(
     id="density",
     title="Density",
-    description="Published points in cells of 0.1 degree that the outlines of published blocks meet.",
+    description="Number of published points in cells of 0.1 degrees that intersect the outlines "
+    "of published blocks.",
     source=density_cell,
     key=column_property(density_cell.c.id, "Identifier of the cell"),
     properties=(
-        Property("n_points", "Points served in the cell, of all blocks", SERVED),
-        column_property(density_cell.c.n_blocks, "Blocks that meet the cell"),
+        Property("n_points", "Served points of all blocks in the cell", SERVED),
+        column_property(density_cell.c.n_blocks, "Blocks that intersect the cell"),
         Property(
             "area_km2",
-            "Area of the cell inside outlines of blocks; the whole cell's at most where blocks overlap",
+            "Area of the cell inside the outlines of blocks; at most the area of the whole cell",
             AREA_KM2,
             unit="km2",
         ),
-        Property("points_per_km2", "Points by that area", SERVED / AREA_KM2, unit="1/km2"),
+        Property(
+            "points_per_km2", "Points per square kilometre of that area", SERVED / AREA_KM2, unit="1/km2"
+        ),
     ),
     geometry_type="Polygon",
     geometry=density_cell.c.geom,

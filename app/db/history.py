@@ -90,18 +90,21 @@ def _property(name: str, title: str, unit: str = "", **options: Any) -> Property
 HISTORY = Collection(
     id="point-history",
     title="History of points",
-    description="Points that registrations have tried, how they fared, and which should be suspended.",
+    description="Points that registrations have tried, with their success counts and proposals "
+    "for suspension.",
     source=point_history.join(point, point.c.id == point_history.c.point_id),
     key=column_property(point.c.id, "Identifier of the point"),
     properties=(
         _property("state", "Served, proposed for suspension, or suspended", choices=STATES),
-        _property("attempts", "Scenes that showed it and tried it"),
-        _property("successes", "Scenes in which it was active at the end"),
+        _property("attempts", "Scenes that showed the point and tried it"),
+        _property("successes", "Scenes in whose final adjustment the point was active"),
         _property("expected", "Successes of an ordinary point in the same scenes"),
-        _property("health", "Successes against those expected, 0 to 1"),
+        _property("health", "Successes relative to the expected successes, 0 to 1"),
         _property("last_attempt", "When it was tried last", nullable=True),
-        _property("last_success", "When it last served", nullable=True),
-        _property("mean_residual_px", "Mean distance of its measures", "px", nullable=True),
+        _property("last_success", "Time of the last success", nullable=True),
+        _property(
+            "mean_residual_px", "Mean distance of measures from registered models", "px", nullable=True
+        ),
         _property("mean_east_m", "Mean of its residuals eastwards", "m", nullable=True),
         _property("mean_north_m", "Mean of its residuals northwards", "m", nullable=True),
         _property("suspended_at", "When it was suspended", nullable=True),

@@ -96,7 +96,7 @@ POINTS = Collection(
         column_property(point.c.corr_east_north, "Correlation of east and north"),
         column_property(point.c.corr_east_up, "Correlation of east and height"),
         column_property(point.c.corr_north_up, "Correlation of north and height"),
-        column_property(point.c.n_views, "Images that see the point"),
+        column_property(point.c.n_views, "Images that show the point"),
         column_property(point.c.saliency, "How well its chips can be located, 0 to 1"),
         column_property(point.c.typology, "Kind of object on the ground"),
         column_property(point.c.first_view, "Date of the first view"),

@@ -45,19 +45,21 @@ class MakeMosaic:
     """The inputs of a mosaic.
 
     Attributes:
-        scenes: ids of uploaded scenes with the same bands, 1 to 100. What lies whole within those given
-            before is not shown.
-        registrations: ids of the jobs that registered them, such as one of register-scenes; of several
-            that registered the same scene the last counts. By default none: the models that were
+        scenes: ids of 1 to 100 uploaded scenes with the same bands. A scene that lies completely within
+            earlier scenes of this list is not shown.
+        registrations: ids of the jobs that registered the scenes, such as one job register-scenes. If
+            several jobs registered the same scene, the last one counts. By default none: the models
             uploaded with the scenes are used.
         dem: heights of the ground, or a surface: a path below AMERS_REFERENCE_FOLDER.
-        vertical: vertical datum of these heights, where the file does not state it.
-        geoid: grid file of the geoid, where PROJ has none; a path likewise.
-        height_m: height of flat ground above the ellipsoid, metres, in place of `dem`. Images on a map
-            need neither.
-        crs: code of the reference system of the map; by default the UTM zone of the middle.
-        gsd_m: ground sampling of the map, metres; by default that of the finest scene.
-        bbox: west, south, east, north in degrees, the only ground wanted; by default all.
+        vertical: vertical datum of these heights, if the file does not state it.
+        geoid: grid file of the geoid, if PROJ has none: a path below AMERS_REFERENCE_FOLDER.
+        height_m: height of flat ground above the ellipsoid, metres, instead of `dem`. Ortho-images need
+            neither.
+        crs: code of the reference system of the map; by default the UTM zone at the centre of the
+            scenes.
+        gsd_m: pixel size of the map, metres; by default the ground sampling of the finest scene.
+        bbox: bounding box of the map: west, south, east, north in degrees; by default the ground of all
+            scenes.
         level: change the grey values of the scenes so that they agree where they overlap.
         feather_px: width of the strip along a seam in which both scenes are blended, 0 to 512 pixels.
         hide: do not use a scene where the ground is hidden from it by other ground; other scenes fill
@@ -183,8 +185,9 @@ def _run(work: Work) -> Commit:
 MAKE_MOSAIC = Process(
     id="make-mosaic",
     title="Make a mosaic",
-    description="Bring uploaded scenes onto one map, on a terrain of the server, cut where they agree "
-    "best, and measure the steps at the seams. Register the scenes together first, so that they fit.",
+    description="Make one ortho-image of uploaded scenes on a terrain of the server, with seams "
+    "where the scenes agree best, and measure the steps at the seams. Register the scenes "
+    "together first, so that their models agree.",
     scope=Scope.ADMIN,
     inputs=MakeMosaic,
     outputs={
@@ -217,7 +220,7 @@ MAKE_MOSAIC = Process(
             "items": {"type": "object"},
             "title": "Steps at the seams of every pair of scenes, metres",
         },
-        "vertical": {"type": "string", "title": "How the vertical datum of the ground is known"},
+        "vertical": {"type": "string", "title": "Source of the vertical datum of the ground"},
         "statements": STATEMENTS_VALUE,
     },
 )

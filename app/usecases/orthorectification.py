@@ -372,7 +372,8 @@ def _run(work: Work) -> Commit:
 ORTHORECTIFY = Process(
     id="orthorectify",
     title="Orthorectify a scene",
-    description="Resample an uploaded scene to a map, by its model and a terrain uploaded with it.",
+    description="Resample an uploaded scene to a map, with its sensor model and a terrain that "
+    "was uploaded with the scene.",
     scope=Scope.REGISTER,
     inputs=OrthorectifyScene,
     outputs={ORTHO_NAME: "The scene on the map, a cloud-optimised GeoTIFF."},

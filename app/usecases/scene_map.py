@@ -238,8 +238,8 @@ def _run(work: Work) -> Commit:
 MAP_SCENE = Process(
     id="map-scene",
     title="Show a registered scene on the map",
-    description="Draw an uploaded scene on the map of the web, through its delivered model (raw) and "
-    "through its registered one, as grey tiles at falling resolutions.",
+    description="Draw an uploaded scene on the web map as grey tiles at decreasing resolutions, "
+    "with its delivered model (raw) and with its registered model.",
     scope=Scope.REGISTER,
     inputs=MapScene,
     outputs={

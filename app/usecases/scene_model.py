@@ -29,10 +29,11 @@ class ReadModel:
 
     Attributes:
         scene: id of an uploaded scene.
-        sigma_m: accuracy of its model, metres (1 sigma); by default that stated at the upload.
-        model: name of the file with the scene's model; by default it is found by its name.
-        crop_origin: LINE,SAMPLE of the image's first pixel in the image that the model is for; by
-            default as its files state it.
+        sigma_m: accuracy of the delivered sensor model, metres (1 sigma); by default the value stated at
+            the upload.
+        model: name of the file with the sensor model of the scene; by default it is found by its name.
+        crop_origin: position LINE,SAMPLE of the first pixel of the image in the full image of the sensor
+            model; by default the position that the files state.
     """
 
     scene: UUID

@@ -65,8 +65,8 @@ def _write(image: Path, tiles: Path, work: Work) -> TileIndex:
 VIEW_SCENE = Process(
     id="view-scene",
     title="View a scene",
-    description="Draw the raw image of an uploaded scene as tiles for a viewer: grey values at falling "
-    "resolutions, without georeferencing.",
+    description="Draw the raw image of an uploaded scene as tiles for a viewer: grey values at "
+    "decreasing resolutions, without georeferencing.",
     scope=Scope.REGISTER,
     inputs=ViewScene,
     outputs={

@@ -189,8 +189,8 @@ def _run(work: Work) -> Commit:
 STRAIGHTEN_SCENE = Process(
     id="straighten-scene",
     title="Straighten a registered scene",
-    description="Resample an uploaded scene by the displacement of its lines and samples that its "
-    "registration found, so that an RPC carries its model.",
+    description="Resample an uploaded scene by the displacements of lines and samples that its "
+    "registration measured, so that an RPC expresses its model.",
     scope=Scope.REGISTER,
     inputs=StraightenScene,
     outputs={STRAIGHTENED_NAME: "The scene with its RPC, a cloud-optimised GeoTIFF."},
@@ -199,7 +199,7 @@ STRAIGHTEN_SCENE = Process(
     values={
         "lines": {"type": "integer", "title": "Lines of the image, px"},
         "samples": {"type": "integer", "title": "Samples of the image, px"},
-        "largest_px": {"type": "number", "title": "By which a pixel was moved, at most, px"},
+        "largest_px": {"type": "number", "title": "Largest displacement of a pixel, px"},
         "seen": {"type": "number", "title": "Share of the pixels with data"},
         "model": {"type": "string", "title": "The model in the tags, and how close it is"},
         "statements": STATEMENTS_VALUE,

@@ -53,14 +53,15 @@ class MakeSurface:
 
     Attributes:
         scenes: ids of uploaded scenes of the same ground, 2 to 100.
-        registrations: ids of the jobs that registered them, such as one of register-scenes; of several
-            that registered the same scene the last counts. By default none: the models that were
-            uploaded with the scenes are used, which have to agree, such as those of one adjusted block.
+        registrations: ids of the jobs that registered the scenes, such as one job register-scenes. If
+            several jobs registered the same scene, the last one counts. By default none: the models
+            uploaded with the scenes are used. These models must agree, such as the models of one
+            adjusted block.
         gsd_m: side of a cell, metres; by default the ground sampling of the finest scene.
-        heights_m: lowest and highest surface above the ellipsoid, metres; by default the heights that
-            the models are meant for.
-        pairs: number of pairs of scenes at most, 1 to 100.
-        fill_cells: gaps are filled from heights at most this many cells away, 0 to 20.
+        heights_m: lowest and highest height of the surface above the ellipsoid, metres; by default the
+            height range of the sensor models.
+        pairs: largest number of scene pairs that are matched, 1 to 100.
+        fill_cells: fill gaps from heights at most this many cells away, 0 to 20.
     """
 
     scenes: tuple[UUID, ...]
@@ -150,15 +151,16 @@ def _scene(work: Work, stored: StoredScene, stack: ExitStack) -> SurfaceScene:
 MAKE_SURFACE = Process(
     id="make-surface",
     title="Make a surface",
-    description="Make the surface that uploaded scenes of the same ground show: heights with their "
-    "accuracy, on a map. Register the scenes together first, so that their models agree.",
+    description="Make a surface model from uploaded scenes of the same ground: heights with "
+    "their accuracy, on a map. Register the scenes together first, so that their models agree.",
     scope=Scope.REGISTER,
     inputs=MakeSurface,
     outputs={
         SURFACE_NAME: "The surface, a cloud-optimised GeoTIFF with four bands: height above the "
-        "ellipsoid and its standard deviation in metres, number of images, and a number for the reason "
-        "why a cell has no height.",
-        REPORT_NAME: "A page that shows it: heights, accuracy, pairs of scenes, empty cells by reason.",
+        "ellipsoid and its standard deviation in metres, number of images, and a code for the "
+        "reason if a cell has no height.",
+        REPORT_NAME: "A page about the surface: heights, accuracy, pairs of scenes, empty cells "
+        "by reason.",
     },
     check=_check,
     run=_run,
@@ -171,7 +173,7 @@ MAKE_SURFACE = Process(
             "type": ["number", "null"],
             "title": "Median of the standard deviations of the heights, metres",
         },
-        "cells": {"type": "object", "title": "Cells by why they have no height, or that they have one"},
+        "cells": {"type": "object", "title": "Number of cells with a height, and without one by reason"},
         "pairs": {
             "type": "array",
             "items": {"type": "object"},

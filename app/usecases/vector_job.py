@@ -62,7 +62,7 @@ class VectorInputs:
         vertical: vertical datum of the heights, where the terrain file does not state it.
         geoid: name of an uploaded grid file of the geoid.
         fill_px: voids are filled from heights at most this many nodes away.
-        format: of the outputs, "gpkg" or "geojson".
+        format: format of the outputs, "gpkg" or "geojson".
     """
 
     scene: UUID
@@ -81,11 +81,11 @@ class CorrectVectors(VectorInputs):
     """The inputs of a correction of vectors.
 
     Attributes:
-        vectors: name of the file uploaded beside the image, GeoJSON in pixel coordinates.
-        sigma_m: accuracy on the Earth of a model that is not registered, one standard deviation of each
-            coordinate, metres; null when unknown.
-        crs: code of the reference system of the map; by default the UTM zone of the scene, in GeoJSON
-            longitude and latitude.
+        vectors: name of the file uploaded with the image, GeoJSON in pixel coordinates.
+        sigma_m: accuracy on the Earth of a model that is not registered, one standard deviation per
+            coordinate, metres; null if unknown.
+        crs: code of the reference system of the map; by default the UTM zone of the scene, or longitude
+            and latitude for GeoJSON.
         options: of the correction.
     """
 
@@ -99,8 +99,8 @@ class ProjectVectors(VectorInputs):
     """The inputs of a projection of vectors.
 
     Attributes:
-        vectors: name of the file uploaded beside the image, GeoJSON in longitude and latitude, or in the
-            reference system that it names.
+        vectors: name of the file uploaded with the image, GeoJSON in longitude and latitude, or in the
+            reference system that the file names.
         options: of the projection.
     """
 
@@ -262,7 +262,7 @@ _COUNTS: dict[str, dict[str, Any]] = {
     "left_out": {
         "type": "array",
         "items": {"type": "integer"},
-        "title": "Numbers of the features, from 1, that meet no ground",
+        "title": "Numbers of the features, from 1, whose lines of sight do not meet the terrain",
     },
     "unusable": {
         "type": "object",
@@ -278,8 +278,8 @@ _COUNTS: dict[str, dict[str, Any]] = {
 CORRECT_VECTORS = Process(
     id="correct-vectors",
     title="Correct vectors",
-    description="Bring vectors that were drawn on an uploaded scene onto the map, by its model and a "
-    "terrain uploaded with it, with the predicted accuracy of every vertex.",
+    description="Transform vectors drawn on an uploaded scene to the map, with its sensor model "
+    "and a terrain that was uploaded with the scene. Every vertex gets a predicted accuracy.",
     scope=Scope.REGISTER,
     inputs=CorrectVectors,
     outputs=_outputs(
@@ -301,8 +301,8 @@ CORRECT_VECTORS = Process(
 PROJECT_VECTORS = Process(
     id="project-vectors",
     title="Project vectors",
-    description="Bring vectors of the map into the pixel coordinates of an uploaded scene, by its model "
-    "and a terrain uploaded with it, and name the vertices that the ground hides.",
+    description="Transform vectors of the map to pixel coordinates of an uploaded scene, with "
+    "its sensor model and a terrain that was uploaded with the scene, and mark hidden vertices.",
     scope=Scope.REGISTER,
     inputs=ProjectVectors,
     outputs=_outputs(
@@ -313,7 +313,7 @@ PROJECT_VECTORS = Process(
     run=_project,
     values={
         **_COUNTS,
-        "hidden_vertices": {"type": "integer", "title": "Vertices that other ground hides"},
+        "hidden_vertices": {"type": "integer", "title": "Vertices that are hidden by other ground"},
         "outside": {"type": "integer", "title": "Features that the scene does not show"},
     },
 )

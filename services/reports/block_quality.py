@@ -164,7 +164,7 @@ class BlockQualityReport:
     Attributes:
         format: of this document.
         block: what was assessed.
-        requirements: what the block shall reach.
+        requirements: requirements for the block.
         verdict: "met", "missed", "not shown" by what was measured, or "not specified".
         verdict_words: the same as a sentence.
         criteria: each figure that is compared with a requirement.

@@ -30,16 +30,19 @@ _ATTRIBUTION = cast(
 BLOCKS = Collection(
     id="blocks",
     title="Blocks",
-    description="Productions of points, published as a whole; an administrator sees all of them.",
+    description="Blocks: productions of points that are published as a whole. Administrators "
+    "see unpublished blocks too.",
     source=block,
     key=column_property(block.c.number, "Number of this version"),
     properties=(
         column_property(block.c.id, "Name of the block"),
         column_property(block.c.version, "Version"),
         column_property(block.c.title, "Title"),
-        Property("attribution", "What the terms of its data ask to show", _ATTRIBUTION, nullable=True),
+        Property(
+            "attribution", "Attribution that the terms of the data require", _ATTRIBUTION, nullable=True
+        ),
         column_property(block.c.state, "State", choices=get_args(BlockState)),
-        column_property(block.c.priority, "Which block comes first over one place"),
+        column_property(block.c.priority, "Priority over other blocks of the same place"),
         column_property(block.c.n_points, "Points"),
         column_property(
             block.c.n_unserved, "Points not served: superseded by a better block, or suspended"
@@ -103,7 +106,7 @@ SCENES = Collection(
     properties=(
         Property(
             "datetime",
-            "When it was taken; when it was uploaded as long as that is not known",
+            "Acquisition time; the time of the upload if the acquisition time is unknown",
             func.coalesce(scene.c.acquired_at, scene.c.created_at),
         ),
         column_property(scene.c.name, "Name", name="title"),

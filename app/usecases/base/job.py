@@ -33,7 +33,7 @@ class MakeBase:
     Attributes:
         id: name of the block.
         bbox: west, south, east, north of the region, degrees.
-        archive: whose images are used.
+        archive: archive whose images are used.
         version, title: of the block.
         since: leave out images before this day, UTC: YYYY-MM-DD.
         dates: number of clear dates that every place needs, distributed over seasons and orbits.
@@ -43,8 +43,8 @@ class MakeBase:
         min_clear: smallest clear share of an image in the region according to its mask, percent.
         dem: heights of the ground, a path below AMERS_REFERENCE_FOLDER; by default the Copernicus DEM of
             the catalogues.
-        vertical: vertical datum of these heights, where the file does not state it.
-        geoid: grid of the geoid, a path below AMERS_REFERENCE_FOLDER, where PROJ has none.
+        vertical: vertical datum of these heights, if the file does not state it.
+        geoid: grid of the geoid, a path below AMERS_REFERENCE_FOLDER, if PROJ has none.
         publish: whether the block is published at once.
     """
 
@@ -188,8 +188,8 @@ MAKE_BASE = Process(
         "on_the_earth": {"type": "object", "title": "Accuracy on the Earth"},
         "dates": {"type": "array", "items": {"type": "string"}, "title": "Dates of its images"},
         "dates_apart_m": {"type": "number", "title": "Largest distance between two dates, metres"},
-        "sigma_m": {"type": "number", "title": "Error of the frame, a coordinate, one sigma, metres"},
+        "sigma_m": {"type": "number", "title": "Error of the frame, one sigma per coordinate, metres"},
         "bytes_read": {"type": "integer", "title": "Bytes read at addresses"},
-        "attribution": {"type": "string", "title": "What the terms of the data ask to state"},
+        "attribution": {"type": "string", "title": "Attribution that the terms of the data require"},
     },
 )

@@ -68,7 +68,7 @@ class SelectedPoints:
     """Points of the store that make a new block.
 
     Attributes:
-        metadata: of the new block.
+        metadata: id of the new block.
         points: with the keys of their chip files in the storage.
         typology: what each point is on the ground; None where unknown.
     """
@@ -258,7 +258,8 @@ def _run(work: Work) -> Commit:
 EXPORT_BLOCK = Process(
     id="export-block",
     title="Export points as a block",
-    description="Write the points served in a box, with their chips, as a block to take elsewhere.",
+    description="Write the served points of a bounding box, with their chips, as a block that "
+    "can be downloaded.",
     scope=Scope.READ,
     inputs=ExportBlock,
     outputs={ARCHIVE: "The block: a zip of its folder."},

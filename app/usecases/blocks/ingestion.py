@@ -33,7 +33,8 @@ class IngestBlock:
         path: folder of the block on the server, below AMERS_INGEST_FOLDER.
         upload: id of an uploaded archive.
         publish: whether the block is published at once.
-        priority: where blocks overlap, points of the block with the greater priority are served.
+        priority: priority of the block: where blocks overlap, points of the block with the higher
+            priority are served.
     """
 
     path: str | None = None
@@ -123,7 +124,8 @@ def _block_root(name: str, members: tuple[Member, ...]) -> PurePosixPath:
 INGEST_BLOCK = Process(
     id="ingest-block",
     title="Ingest a block",
-    description="Check a block of points, on the server or uploaded, and load it into the store.",
+    description="Check a block of points that is on the server or was uploaded, and load it "
+    "into the store.",
     scope=Scope.ADMIN,
     inputs=IngestBlock,
     outputs={},
@@ -138,7 +140,7 @@ INGEST_BLOCK = Process(
         "relative_to_control_points": {"type": "object", "title": "CE90, LE90 of the median point"},
         "on_the_earth": {
             "type": "object",
-            "title": "The same with the frame of the block",
+            "title": "CE90, LE90 of the median point, with the frame of the block",
         },
         "quality": {"type": "object", "title": "Density, views per point and stated precision"},
     },

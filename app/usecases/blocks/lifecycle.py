@@ -76,7 +76,8 @@ def ingest_block(
         storage: receives the chips.
         folder: of the block.
         progress: receives the fraction done and a message.
-        priority: where blocks overlap, points of the block with the greater priority are served.
+        priority: priority of the block: where blocks overlap, points of the block with the higher
+            priority are served.
 
     Raises:
         FormatError: the block breaks the format; nothing is changed.

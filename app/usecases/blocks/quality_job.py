@@ -36,20 +36,22 @@ class AssessBlock:
     Attributes:
         block: number, ID or ID@VERSION of the block, in any state.
         sites: reference ortho-images of places that the production did not use.
-        control_sites: those of places that the production used as control.
-        site_sigma_m: accuracy of these images on the Earth, one standard deviation a coordinate.
-        search_m: largest shift that is searched at the sites; by default three standard deviations of
-            what block and images declare.
-        dem: heights that those of the points are compared with.
-        vertical: vertical datum of these heights, where the file does not state it.
-        geoid: grid file of the geoid, where PROJ has none.
-        dem_sigma_m: of the heights, one standard deviation; by default that of each cell of a surface,
-            else a tenth of the distance of the nodes.
-        dem_frame_sigma_m: of the error that all the heights share; unknown by default.
-        exclude: masks of ground where no points are expected: GeoJSON, or images on a map, not 0 there.
-        exclude_heights: masks of ground where the heights are not to be trusted.
-        land_cover: image on a map with classes of the ground, to tell heights apart.
-        required: what the block shall reach.
+        control_sites: reference ortho-images of places that the production used as control.
+        site_sigma_m: accuracy of the reference ortho-images on the Earth, one standard deviation per
+            coordinate, metres.
+        search_m: largest shift that is searched at the reference images, metres; by default three times
+            the sigma that block and images declare.
+        dem: heights that the heights of the points are compared with.
+        vertical: vertical datum of these heights, if the file does not state it.
+        geoid: grid file of the geoid, if PROJ has none.
+        dem_sigma_m: sigma of single heights, metres; by default the sigma of each cell of a surface,
+            otherwise a tenth of the posting.
+        dem_frame_sigma_m: sigma of the common error of all heights, metres; by default unknown.
+        exclude: masks of ground where no points are expected: GeoJSON, or images on a map that are not 0
+            there.
+        exclude_heights: masks of ground where the heights of `dem` must not be used.
+        land_cover: image of land cover classes on a map; errors of heights are also reported by class.
+        required: requirements for the block.
     """
 
     block: str
@@ -156,7 +158,7 @@ ASSESS_BLOCK = Process(
     values={
         "specification": {
             "enum": list(get_args(BlockVerdict)),
-            "title": "Whether the block reaches what is specified",
+            "title": "Whether the block meets its specification",
         },
         "words": {"type": "string", "title": "The same as a sentence"},
     },

@@ -77,7 +77,7 @@ def read_base(connection: Connection, reference: str, version: str = "") -> Base
     Args:
         connection: of a snapshot.
         reference: number, ID or ID@VERSION of the block.
-        version: of the renewed block; by default the next whole number.
+        version: version of the renewed block; by default the next whole number.
 
     Raises:
         NotFound: there is no such block, or it is not published.

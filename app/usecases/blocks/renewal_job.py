@@ -31,8 +31,9 @@ class RenewBlock:
         block: number, ID or ID@VERSION of the published block.
         jobs: successful jobs of register-scene on this block with the verdict "good", or of
             register-scenes, whose scenes with this verdict are used.
-        scenes: the only scenes to use of jobs of register-scenes, all "good"; none named means all.
-        version: of the renewed block; by default the next whole number.
+        scenes: scenes of the jobs register-scenes that are used; all of them must be "good". By default
+            all "good" scenes.
+        version: version of the renewed block; by default the next whole number.
     """
 
     block: str
@@ -107,8 +108,9 @@ def _run(work: Work) -> Commit:
 RENEW_BLOCK = Process(
     id="renew-block",
     title="Renew a block",
-    description="Stage a version of a block with views of scenes registered on it, with new points "
-    "where it is short of them, without the points that later scenes no longer find.",
+    description="Stage a new version of a block: add views of scenes that were registered on "
+    "it, add points where the block has too few, and remove points that later scenes no longer "
+    "find.",
     scope=Scope.ADMIN,
     inputs=RenewBlock,
     outputs={DOCUMENT: "What is renewed: scenes, new views, new points, proposed withdrawals."},
@@ -120,9 +122,9 @@ RENEW_BLOCK = Process(
         "version": {"type": "string", "title": "Version"},
         "state": {"enum": ["staged"], "title": "State: an administrator publishes it"},
         "points": {"type": "integer", "title": "Points of the version"},
-        "renews": {"type": "string", "title": "Version that it renews"},
+        "renews": {"type": "string", "title": "Version that is renewed"},
         "new_views": {"type": "integer", "title": "Views added"},
-        "new_points": {"type": "integer", "title": "Points added where the block was short of them"},
+        "new_points": {"type": "integer", "title": "Points added where the block had too few"},
         "proposed_withdrawals": {"type": "integer", "title": "Points left out as vanished"},
     },
 )

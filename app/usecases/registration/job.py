@@ -52,26 +52,29 @@ class RegisterScene:
 
     Attributes:
         scene: id of an uploaded scene.
-        sigma_m: accuracy of its model, metres (1 sigma); by default that stated at the upload.
-        model: name of the file with the scene's model; by default it is found by its name.
+        sigma_m: accuracy of the delivered sensor model, metres (1 sigma); by default the value stated at
+            the upload.
+        model: name of the file with the sensor model of the scene; by default it is found by its name.
         method: "points", "reference", or "auto": on points, and where there are none on a reference; or
             "marks": on the marks of `control` alone.
         bands: bands to use, such as "2" or "1,2,3" or "3:0.3,2:0.7"; by default the panchromatic band or
             the mean of the visible ones.
-        mask: name of an image of the same ground; pixels are not used where it is not zero.
-        check_points: name of a file with points that are held out of the registration.
-        check_heights: vertical datum of the check points' heights, where their format cannot state it.
-        control: name of a file with ground points that a person marked in the scene: observations of the
-            same adjustment, and what the scene is registered on where nothing else shows it.
-        control_heights: vertical datum of these heights, where the file does not state it.
-        control_sigma_m: accuracy of this ground where the file states none: horizontal and up, metres (1
-            sigma); by default one pixel.
-        control_frame_sigma_m: error on the Earth that all this ground shares: horizontal and up, metres
-            (1 sigma); by default unknown.
+        mask: name of an image of the same ground that is used as a mask; pixels of the scene are ignored
+            where it is not 0.
+        check_points: name of a file with check points, which take no part in the registration.
+        check_heights: vertical datum of the heights of the check points, if their format cannot state
+            it.
+        control: name of a file with ground points that a person marked in the scene. They take part in
+            the adjustment; without other points, the scene is registered on them alone.
+        control_heights: vertical datum of these heights, if the file does not state it.
+        control_sigma_m: accuracy of the ground points of `control` if the file states none: horizontal
+            and up, metres (1 sigma); by default one pixel.
+        control_frame_sigma_m: common error of all ground points of `control` on the Earth: horizontal
+            and up, metres (1 sigma); by default unknown.
         control_mark_sigma_px: sigma of marks if their file states none, pixels; by default 0.5.
-        crop_origin: LINE,SAMPLE of the image's first pixel in the image that the model is for; by
-            default as its files state it.
-        copy_image: whether a GeoTIFF is copied to the outputs with the refined model in its tags.
+        crop_origin: position LINE,SAMPLE of the first pixel of the image in the full image of the sensor
+            model; by default the position that the files state.
+        copy_image: whether the outputs include a copy of a GeoTIFF with the refined model in its tags.
         options: of the registration.
     """
 

@@ -105,7 +105,7 @@ LAYER_STYLES: Mapping[str, Sequence[Style]] = {
             "m",
         ),
         NumberStyle(
-            "Number of views", "Images that see the point", '"n_views"', (0, 2, 4, 6, 9, 1e6), ""
+            "Number of views", "Images that show the point", '"n_views"', (0, 2, 4, 6, 9, 1e6), ""
         ),
     ),
     "held_area": (
