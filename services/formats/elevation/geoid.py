@@ -81,7 +81,8 @@ def geoid_of_crs(vertical: CRS, place: Array) -> Geoid:
     area = area_of(place)
     group = transformations(compound, area)
     if group.transformers:
-        return _TransformedGeoid(group.transformers[0])
+        # A transformer of a group cannot be pickled, one of its pipeline can.
+        return _TransformedGeoid(Transformer.from_pipeline(group.transformers[0].definition))
     wanted = [GRIDS[name] for name, code in NAMED.items() if vertical == CRS(code) and name in GRIDS]
     for grid in [grid for names in wanted for grid in names]:
         if found_grid(grid) is not None:

@@ -1,11 +1,13 @@
 """Grids of geoids are found where PROJ keeps them, and the message says how to get a missing one."""
 
+import pickle
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pyproj import datadir
 
 from amers.services.errors import MissingGeoid, VerticalDatumError
 from amers.services.formats.elevation import geoid
@@ -65,6 +67,22 @@ def test_a_datum_uses_the_grid_of_a_folder_that_pyproj_does_not_look_in(folder: 
         pytest.skip("pyproj has the grid of EGM96 here")
     write_geoid(folder / "egm96_15.gtx")
     assert geoid_of_crs(vertical, PLACE)(PLACE[None, :]) == pytest.approx(undulation(PLACE[None, :]))
+
+
+def test_a_geoid_that_proj_has_is_used_by_other_processes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_geoid(tmp_path / "egm08_25.gtx")
+    before = datadir.get_data_dir()
+    monkeypatch.setattr(geoid, "grid_folders", list)
+    datadir.append_data_dir(str(tmp_path))
+    try:
+        vertical = vertical_crs("EGM2008")
+        assert vertical is not None
+        again = pickle.loads(pickle.dumps(geoid_of_crs(vertical, PLACE)))
+        assert again(PLACE[None, :]) == pytest.approx(undulation(PLACE[None, :]))
+    finally:
+        datadir.set_data_dir(before)
 
 
 def test_the_variable_of_proj_names_a_folder(tmp_path: Path) -> None:
