@@ -100,12 +100,12 @@ MODULES = (
     _of_service(
         "jobs",
         "usecases/jobs.py db/jobs worker/attempt.py",
-        "lost_attempts job_leases jobs job_progress fair_queue attempt_outcomes",
+        "job_states lost_attempts job_leases jobs job_progress fair_queue attempt_outcomes",
     ),
     _of_service(
         "superseding",
         "db/superseding.py db/density.py",
-        "superseding renewal_density feature_formats reply_models documents",
+        "superseding renewal_density feature_formats reply_models documents unpublished blocks",
     ),
     _of_service(
         "points",
