@@ -6,6 +6,7 @@ condition is dropped, and the values of two arguments are exchanged.
 """
 
 import itertools
+import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -27,10 +28,11 @@ _LEFT_ALONE = m.OneOf(
     m.Expr(m.SimpleString()),
     m.Expr(m.Call(m.Attribute(m.Name("log")))),
 )
+_ANNOTATED = m.Subscript(m.Name("Annotated"))
 _OF_ANY_NUMBER = ("max", "min", "where", "and_", "or_", "greatest", "least")
 """Functions that do something else, and do not fail, with an argument less."""
-_SYMMETRIC = frozenset(_OF_ANY_NUMBER) - {"where"} | {"hypot", "maximum", "minimum", "intersects"}
-"""Functions to which the order of their arguments is nothing."""
+_SYMMETRIC = frozenset(_OF_ANY_NUMBER) | {"hypot", "maximum", "minimum", "intersects"}
+"""Functions to which the order of their arguments is nothing; `where` of a statement, not of NumPy."""
 _FOR_READERS = ("strict", "type_")
 """Named arguments that state what is true without them: equal lengths, the type of a term in SQL."""
 _COMMUTATIVE = (cst.Add, cst.Multiply, cst.BitAnd, cst.BitOr)
@@ -85,11 +87,16 @@ def mutants_of(root: Path, path: str) -> Iterator[Mutant]:
             before = module.code_for_node(node)
             for changed in _changes(node):
                 after = module.code_for_node(changed)
-                if after == before or after.count("None") > before.count("None"):
+                if after == before or _is_none(before, after):
                     continue
                 seen[definition, before, after] += 1
                 number, lines = seen[definition, before, after], (at.start.line, at.end.line)
                 yield Mutant(path, definition, lines, before, after, number, module, node, changed)
+
+
+def _is_none(before: str, after: str) -> bool:
+    """Whether a change makes a value None."""
+    return after.count("None") > before.count("None") or re.search(r"=\s*None$", after) is not None
 
 
 def _name_of(statement: cst.CSTNode) -> str:
@@ -105,7 +112,9 @@ def _changeable(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
     if not m.matches(node, _LEFT_ALONE):
         yield node
         for child in node.children:
-            yield from _changeable(child)
+            # The first part of what is annotated is a type, as an annotation is.
+            if not (m.matches(node, _ANNOTATED) and child is node.slice[0]):  # type: ignore[attr-defined]
+                yield from _changeable(child)
 
 
 def _changes(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
@@ -142,7 +151,9 @@ def _called(call: cst.Call) -> str:
 
 def _exchanged(call: cst.Call) -> Iterator[cst.CSTNode]:
     """A call with the values of two neighbouring arguments exchanged."""
-    if _called(call) in _SYMMETRIC:
+    if _called(call) in _SYMMETRIC and not m.matches(
+        call.func, m.Attribute(m.Name("np"), m.Name("where"))
+    ):
         return
     for number, (one, other) in enumerate(itertools.pairwise(call.args)):
         if one.star == other.star == "":

@@ -88,7 +88,6 @@ MODULES = (
             *(f"tests/services/test_{one}.py" for one in ("geodesy", "terrain", "map_grid", "datums")),
             "tests/services/orthorectification/test_occlusion.py",
         ),
-        is_everywhere=True,
     ),
     _of_service(
         "auth",

@@ -304,9 +304,12 @@ def test_a_token_may_fill_its_own_quota_to_the_last_byte_and_a_quota_of_nothing_
     """The quotas of the settings are large: they are not those of these tokens."""
     some = create_token(connection, "some", ["register"], storage_quota_bytes=100, job_quota=1).token
     none = create_token(connection, "none", ["register"], storage_quota_bytes=0, job_quota=0).token
-    assert quotas.require_room(connection, settings, some.id, "the image", 100) == 100
+    one = create_token(connection, "one", ["register"], storage_quota_bytes=1, job_quota=1).token
+    for owner, size_bytes in ((some, 100), (some, None), (one, 1), (one, None)):
+        room = quotas.require_room(connection, settings, owner.id, "the image", size_bytes)
+        assert room == quotas.room_left(connection, settings, owner.id) == owner.storage_quota_bytes
     quotas.require_free_job(connection, settings, some)
-    for owner, size_bytes in ((some, 101), (none, 1), (none, None)):
+    for owner, size_bytes in ((some, 101), (one, 2), (none, 1), (none, None)):
         with pytest.raises(TooLarge, match=f"of {owner.storage_quota_bytes} bytes"):
             quotas.require_room(connection, settings, owner.id, "the image", size_bytes)
     assert quotas.room_left(connection, settings, none.id) == 0
