@@ -102,7 +102,7 @@ class WorkOptions:
         cluster: address of the scheduler of a Dask cluster: tcp://HOST:8786.
     """
 
-    work: Path | None = None
+    work: Annotated[Path | None, typer.Option(file_okay=False)] = None
     jobs: Annotated[int, typer.Option(min=1, max=1024, show_default="cores")] = os.cpu_count() or 1
     cluster: str | None = None
 

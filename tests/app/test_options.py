@@ -15,6 +15,7 @@ from amers.services.docstrings import attribute_descriptions
 from amers.services.formats.gcp.csv_points import PIXEL_ORIGINS
 from amers.services.formats.gcp.text_formats import ECEF, LAT_LON_HEIGHT
 from amers.services.quality.check_points import MARKING_SIGMA_PX
+from tests.app.wiring import commands, parameters
 
 
 @dataclass(frozen=True)
@@ -183,3 +184,15 @@ def test_helps_name_the_conventions_and_defaults_of_the_code():
     assert control["control_mark_sigma_px"].endswith(f"by default {MARKING_SIGMA_PX:g}.")
     assert control["control_sigma_axes"].endswith(f"{ECEF} or {LAT_LON_HEIGHT}.")
     assert chips["chip_origin"].endswith(f"{', '.join(PIXEL_ORIGINS)}.")
+
+
+def test_a_folder_of_intermediate_results_may_be_new():
+    """What an interrupted work goes on from is made by its first run."""
+    made = [
+        one
+        for words in commands()
+        for one in parameters(words)
+        if one.name == "work" and one.param_type_name == "option"
+    ]
+    assert len(made) >= 4
+    assert not any(one.type_descriptor.parameter_info.exists for one in made)
