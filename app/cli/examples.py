@@ -16,7 +16,7 @@ EXAMPLES: Mapping[str, tuple[str, str]] = {
         "--bbox 5.3,43.2,5.5,43.4 --id coast --title Coast -o exported",
     ),
     "block quality": ("my-block --site ortho.tif -o quality", "my-block --points-per-km2 1 --ce90-m 3"),
-    "block renew": ("my-block", "my-block --version 3"),
+    "block renew": ("my-block --image scene.tif", "my-block --image scene.tif --version 3"),
     "block frame": (
         "my-block --images a.tif --images b.tif --control marks.csv -o moved",
         "my-block --images a.tif --images b.tif --control marks.csv --check check.csv -o moved",
@@ -94,7 +94,7 @@ EXAMPLES: Mapping[str, tuple[str, str]] = {
         "catalogue.json --area region.geojson -o selection",
         "https://stac.example.org --area region.geojson --since 2024-01-01 -o selection",
     ),
-    "production plan": ("configuration.toml -o plan", "configuration.toml -o plan --json"),
+    "production plan": ("plan.json -o plan", "plan.json -o plan --json"),
     "production run": (
         "a.tif b.tif c.tif -o my-block",
         "a.tif b.tif --gsd-m 0.5,2 --sigma-m 5 --control marks.csv -o my-block",
