@@ -25,7 +25,8 @@ INTRODUCTION = (
     "Copy-and-paste examples for common clients of an Amers service. Requests for points need a token "
     "of scope `read`, requests for scenes a token of scope `register`. An administrator creates tokens "
     "with `amers token create`. If the points of the service are public, leave the token out. The tests "
-    "of Amers run these examples against a service and fill in the forms of QGIS."
+    "of Amers run these examples against a service and fill in the forms of QGIS. An example states if "
+    "the tests need more software to run it than Amers installs."
 )
 EXAMPLE = "https://gcp.example.org"
 """The address of the service in the documentation."""
@@ -44,7 +45,7 @@ class Lines:
         text: the lines; `BASE` stands for the address of the service without a slash at its end.
     """
 
-    language: Literal["bash", "python", "text"]
+    language: Literal["bash", "python", "r", "javascript", "text"]
     text: str
 
     def at(self, base: str, box: Box = EXAMPLE_BOX) -> str:
@@ -64,12 +65,21 @@ class Recipe:
         about: what the reader does before copying; code is between backticks.
         steps: lines to copy, in their order.
         after: what the reader can do afterwards.
+        needs: software without which the tests skip the lines; "" if the tests always run them.
     """
 
     client: str
     about: str
     steps: tuple[Lines, ...]
     after: str = field(default="")
+    needs: str = field(default="")
+
+    @property
+    def introduction(self) -> str:
+        """What stands before the lines: what the reader does, and where the tests run the lines."""
+        if not self.needs:
+            return self.about
+        return f"{self.about} The tests of Amers run this example only on machines with {self.needs}."
 
 
 RECIPES = (
@@ -116,6 +126,7 @@ ogr2ogr -spat 5.22 43.21 5.27 43.26 -where "saliency > 0.3" points.gpkg OAPIF:BA
 """,
             ),
         ),
+        needs="gdal-bin of Debian",
     ),
     Recipe(
         "QGIS 3.22 and later",
@@ -164,6 +175,39 @@ print(points[["saliency", "n_views", "geometry"]])
 """,
             ),
         ),
+    ),
+    Recipe(
+        "R with sf and httr2",
+        "The first lines read the points with the GDAL library of sf. GDAL requests all pages of the "
+        "reply. The last lines use httr2 to request the points that match a CQL2 filter, and convert the "
+        "reply into a table of sf. This reply contains at most 10,000 points. The pipe `|>` needs R 4.1 "
+        "or later.",
+        (
+            Lines(
+                "r",
+                """
+library(sf)
+Sys.setenv(GDAL_HTTP_HEADER_FILE = "amers-header")
+box <- setNames(c(5.22, 43.21, 5.27, 43.26), c("xmin", "ymin", "xmax", "ymax"))
+outline <- st_as_text(st_as_sfc(st_bbox(box)))
+points <- st_read("OAPIF:BASE", layer = "points", wkt_filter = outline)
+print(points[c("saliency", "n_views")])
+""",
+            ),
+            Lines(
+                "r",
+                """
+library(httr2)
+reply <- request("BASE/collections/points/items") |>
+  req_url_query(bbox = "5.22,43.21,5.27,43.26", filter = "saliency > 0.3", limit = 10000) |>
+  req_headers(Authorization = paste("Bearer", Sys.getenv("TOKEN")), Accept = "application/geo+json") |>
+  req_perform()
+salient <- st_read(resp_body_string(reply), quiet = TRUE)
+print(nrow(salient))
+""",
+            ),
+        ),
+        needs="R, sf and httr2",
     ),
     Recipe(
         "Python client of Amers",
@@ -225,6 +269,38 @@ for item in catalog.search(collections=["scenes"], bbox=[5.22, 43.21, 5.27, 43.2
             ),
         ),
     ),
+    Recipe(
+        "JavaScript with fetch",
+        "The lines request the points of a bounding box as GeoJSON. A reply contains one page of at most "
+        "1000 points. The link `next` of a page is the address of the next page. The last page has no "
+        "such link. Save the lines as `points.mjs` and run them with `node points.mjs`, in Node.js 18 "
+        "or later.",
+        (
+            Lines(
+                "javascript",
+                """
+const headers = { Authorization: `Bearer ${process.env.TOKEN}`, Accept: "application/geo+json" };
+const points = [];
+let url = "BASE/collections/points/items?bbox=5.22,43.21,5.27,43.26&limit=1000";
+while (url) {
+  const reply = await fetch(url, { headers });
+  if (!reply.ok) throw new Error(`${reply.status}: ${await reply.text()}`);
+  const page = await reply.json();
+  points.push(...page.features);
+  url = page.links.find((link) => link.rel === "next")?.href;
+}
+console.log(points.length, "points");
+for (const { id, geometry, properties } of points.slice(0, 3)) {
+  console.log(id, geometry.coordinates, properties.saliency);
+}
+""",
+            ),
+        ),
+        "The lines also work in a script of type `module` on a web page. There, replace "
+        "`process.env.TOKEN` by a token that the user enters. Do not write a token into the page, because "
+        "every visitor could read it. A page of another site can call the service only if the setting "
+        "`AMERS_CORS_ORIGINS` of the service names this site.",
+    ),
 )
 
 
@@ -270,7 +346,7 @@ def as_markdown(base: str) -> str:
         "A running service shows this page at `/connect`, with its own address in the examples."
     )
     for recipe in RECIPES:
-        parts += [f"## {recipe.client}", paragraph(recipe.about)]
+        parts += [f"## {recipe.client}", paragraph(recipe.introduction)]
         parts += [f"```{lines.language}\n{lines.at(base)}\n```" for lines in recipe.steps]
         parts += [paragraph(recipe.after)] if recipe.after else []
     return "\n\n".join(parts) + "\n"

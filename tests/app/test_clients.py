@@ -203,11 +203,20 @@ SHOWN = {
     "curl": '"numberMatched": {}',
     "GDAL 3.6 and 3.12": "Feature Count: 60",
     "geopandas 1": "saliency  n_views",
+    "R with sf and httr2": "Simple feature collection with {} features and 2 fields",
     "Python client of Amers": "{} points; Test block calanques",
     "OWSLib": "{} [",
     "pystac-client": "",
+    "JavaScript with fetch": "{} points\n",
 }
 """What the lines of a client print; `{}` is the number of points in the box."""
+SHELLS = {
+    "bash": ("bash", "-euo", "pipefail", "-c"),
+    "python": (sys.executable, "-c"),
+    "r": ("Rscript", "-e"),
+    "javascript": ("node", "--input-type=module", "-e"),
+}
+"""The command that runs lines of a language, which are its last argument."""
 
 
 @pytest.fixture(scope="module")
@@ -221,12 +230,15 @@ def reader_s_folder(served, tmp_path_factory) -> Path:
 
 def run_lines(recipe: Recipe, served: Served, folder: Path) -> str:
     """The output of the lines for one client; the token is pasted where they ask for it."""
-    secret = served.authorization["Authorization"].split()[1]
     text = "\n".join(lines.at(served.url) for lines in recipe.steps)
-    language = recipe.steps[0].language
-    shell = [sys.executable, "-c"] if language == "python" else ["bash", "-euo", "pipefail", "-c"]
+    return run_text(text, recipe.steps[0].language, served, folder)
+
+
+def run_text(text: str, language: str, served: Served, folder: Path) -> str:
+    """The output of lines of a language; the token is pasted where they ask for it."""
+    secret = served.authorization["Authorization"].split()[1]
     result = subprocess.run(
-        [*shell, text],
+        [*SHELLS[language], text],
         cwd=folder,
         env={**os.environ, "TOKEN": secret},
         input=f"{secret}\n",
@@ -238,16 +250,39 @@ def run_lines(recipe: Recipe, served: Served, folder: Path) -> str:
     return result.stdout
 
 
+def has_r() -> bool:
+    """Whether the machine has R and both of its packages that the page uses."""
+    if shutil.which("Rscript") is None:
+        return False
+    needed = [*SHELLS["r"], "library(sf); library(httr2)"]
+    return subprocess.run(needed, capture_output=True, check=False).returncode == 0
+
+
 @pytest.mark.parametrize("recipe", RUN, ids=[recipe.client for recipe in RUN])
 def test_the_lines_of_the_page_connect_run_as_they_are(recipe, served, reader_s_folder, in_box):
     if "ogr2ogr" in recipe.steps[0].text and shutil.which("ogr2ogr") is None:
         pytest.skip("Debian's gdal-bin is not installed")
+    if recipe.steps[0].language == "r" and not has_r():
+        pytest.skip("R with sf and httr2 is not installed")
     assert SHOWN[recipe.client].format(in_box.sum()) in run_lines(recipe, served, reader_s_folder)
     if recipe.client == "curl":
         strong = geopandas.read_parquet(reader_s_folder / "points.parquet")
         assert 0 < len(strong) < len(served.points.saliency)
         assert strong["saliency"].min() > 0.3
         assert strong["n_views"].min() >= 3
+
+
+def test_the_lines_of_javascript_follow_the_links_to_all_pages(served, reader_s_folder, in_box):
+    (recipe,) = (recipe for recipe in RECIPES if recipe.client == "JavaScript with fetch")
+    text = recipe.steps[0].at(served.url)
+    assert in_box.sum() > 7
+    pages = text.replace("limit=1000", "limit=7")
+    assert pages != text
+    printed = run_text(pages, "javascript", served, reader_s_folder)
+    assert printed.startswith(f"{in_box.sum()} points\n")
+    refused = text.replace("${process.env.TOKEN}", "wrong")
+    with pytest.raises(AssertionError, match="Error: 401"):
+        run_text(refused, "javascript", served, reader_s_folder)
 
 
 def test_the_page_connect_has_the_address_of_the_service(served):
