@@ -26,7 +26,7 @@ from mutants.modules import ALL, SHORT, Module
 Lines = dict[str, dict[int, set[str]]]
 Document = dict[str, Any]
 """What was recorded, as JSON: `seconds` of each test, tests of `lines` of files, checksums of `code`."""
-SECONDS_OF_A_FILE = {ALL: 240.0, SHORT: 40.0}
+SECONDS_OF_A_FILE = {ALL: 240.0, SHORT: 20.0}
 """Time in which tests of one file begin while they are recorded, by marks: later ones are not tried."""
 
 

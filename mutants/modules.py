@@ -122,7 +122,8 @@ MODULES = (
     _of_service(
         "cli",
         "cli",
-        "wiring exit_statuses command_output options select_command production_plan register_command",
+        "wiring exit_statuses command_output options options_file recorded_help command_help wrong_use "
+        "supervisor output_forms examples_of_commands select_command production_plan register_command",
     ),
 )
 

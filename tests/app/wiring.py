@@ -6,14 +6,17 @@ the notes is where the option goes, and as what.
 """
 
 import contextlib
+import inspect
 import json
 import re
+import sys
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import datetime
 from enum import Enum
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
+from types import SimpleNamespace
 from typing import Any
 from uuid import UUID
 
@@ -24,6 +27,7 @@ from amers.app.cli.commands import COMMANDS
 from amers.app.cli.main import app
 from amers.app.cli.on_demand import Group, Tree, _load
 from amers.app.cli.supervisor import Supervisor
+from amers.app.client import Client
 from amers.app.request_context import Origin
 from tests.app.recorders import Recorders
 from tests.app.stand_ins import Anything, least_results
@@ -202,10 +206,19 @@ def run(words: list[str], folder: Path) -> list[tuple[str, str]]:
 
 
 def _record_service(recorders: Recorders, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let nothing listen, and let no process run: their descriptions are noted, and they end at once.
+    """Let nothing listen, no process run and no service be asked: what they are given is noted.
 
     The demonstration places files as for a user who is not root.
     """
+    asked = {
+        name: recorders.of(function)
+        for name, function in vars(Client).items()
+        if inspect.isfunction(inspect.unwrap(function)) and not name.startswith("_")
+    }
+
+    def client(*given: Any) -> contextlib.AbstractContextManager[SimpleNamespace]:
+        recorders.note("Client", dict(enumerate(given)))
+        return contextlib.nullcontext(SimpleNamespace(**asked))
 
     def listen(address: tuple[str, int], **options: Any) -> Anything:
         recorders.note("create_server", {"address": address, **options})
@@ -215,6 +228,9 @@ def _record_service(recorders: Recorders, monkeypatch: pytest.MonkeyPatch) -> No
         recorders.note("Supervisor.run", {"children": children})
         at_stop()
 
+    for module in [one for name, one in sys.modules.items() if name.startswith(PACKAGE)]:
+        if hasattr(module, "Client"):
+            monkeypatch.setattr(module, "Client", client)
     monkeypatch.setattr("os.getuid", lambda: 1000)
     monkeypatch.setattr("socket.create_server", listen)
     monkeypatch.setattr(Supervisor, "run", run_children)
