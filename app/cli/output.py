@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -12,12 +13,18 @@ from uuid import UUID
 
 import typer
 
+from amers.app.cli.row_labels import SHARES, label
 from amers.app.printable import printable
 from amers.services.statements import Statement, gathered, worth_saying
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 Row = Mapping[str, object]
+
+_ALWAYS_SHOWN = ("damaged", "outdated", "problems")
+"""Lists of which "none" is good news; rows of other empty lists are left out."""
+_DECIMALS = 3
+"""Decimals of numbers for people; small numbers have as many significant digits."""
 
 
 def show(rows: Sequence[Row], *, as_json: bool) -> None:
@@ -38,16 +45,17 @@ def _show_table(rows: Sequence[Row]) -> None:
     from rich.console import Console  # pipes do without its 0.06 s of CPU
     from rich.table import Table
 
-    table = Table(*(rows[0] if rows else ()))
+    table = Table(*map(label, rows[0] if rows else ()))
     for row in rows:
         table.add_row(*map(as_text, row.values()))
     Console().print(table if rows else "none")
 
 
 def show_one(record: Row, *, as_json: bool) -> None:
-    """Print one record as a JSON object, or as one line per field.
+    """Print one record as a JSON object, or as one line per field that has a value.
 
-    What files state, under `statements`, is an array in JSON; people get it by `show_statements`.
+    Lines have names with blanks, axes and units. What files state, under `statements`, is an array in
+    JSON; people get it by `show_statements`.
     """
     if as_json:
         print_json(record)
@@ -55,9 +63,14 @@ def show_one(record: Row, *, as_json: bool) -> None:
     record = dict(record)
     statements: Any = record.pop("statements", ())
     show_statements(statements)
-    width = max(map(len, record), default=0)
-    for name, value in record.items():
-        typer.echo(f"{name:<{width}}  {as_text(value)}")
+    lines = {
+        label(name): (_percent(value) if name in SHARES else as_text(value)) or "none"
+        for name, value in record.items()
+        if name in _ALWAYS_SHOWN or not _is_empty(value)
+    }
+    width = max(map(len, lines), default=0)
+    for name, text in lines.items():
+        typer.echo(f"{name:<{width}}  {text}")
 
 
 def show_statements(statements: Iterable[Statement | Mapping[str, Any]]) -> None:
@@ -77,14 +90,37 @@ def print_json(value: object) -> None:
 
 
 def as_text(value: object) -> str:
-    """A value as text for people."""
+    """A value as text for people; numbers are rounded here and nowhere else."""
     if value is None:
         return "-"
     if isinstance(value, datetime):
         return value.isoformat(sep=" ", timespec="seconds")
+    if isinstance(value, Mapping):
+        return "; ".join(f"{as_text(name)}: {as_text(one)}" for name, one in value.items())
     if isinstance(value, list | tuple | set | frozenset):
-        return ", ".join(map(as_text, value))
-    return printable(str(value))
+        nested = any(isinstance(one, list | tuple) for one in value)
+        return ("; " if nested else ", ").join(map(as_text, value))
+    return _rounded(float(value)) if isinstance(value, float) else printable(str(value))
+
+
+def _rounded(value: float) -> str:
+    """A number with three decimals, or with three digits where it is small; without final zeros."""
+    if not math.isfinite(value):
+        return "-"
+    decimals = _DECIMALS
+    if 0.0 < abs(value) < 0.1:
+        decimals = min(12, _DECIMALS - 1 - math.floor(math.log10(abs(value))))
+    whole, _, fraction = f"{value:.{decimals}f}".partition(".")
+    return f"{whole}.{fraction.rstrip('0') or '0'}"
+
+
+def _percent(share: object) -> str:
+    return f"{100.0 * share:.1f}" if isinstance(share, float) and math.isfinite(share) else "-"
+
+
+def _is_empty(value: object) -> bool:
+    """Whether a value is a text or a list without anything in it."""
+    return isinstance(value, str | Mapping | list | tuple | set | frozenset) and not value
 
 
 def _field_name(name: str) -> str:

@@ -77,7 +77,7 @@ def show_outcome(outcome: Outcome, *, as_json: bool) -> None:
         show_statements(outcome.get("statements", []))
         _show_findings([outcome])
         others = _other_rows(outcome, tuple(outcome))
-        labelled = {_LABELS.get(name, name.replace("_", " ")): value for name, value in others.items()}
+        labelled = {_LABELS.get(name, name): value for name, value in others.items()}
         show_one(_verdict_rows(outcome) | labelled, as_json=False)
         if "marks" in outcome:
             typer.echo()
@@ -155,7 +155,7 @@ def _other_rows(outcome: Outcome, names: tuple[str, ...]) -> dict[str, Any]:
         "exit_status",
         *_STATED,
     }
-    return {name: _rounded(outcome.get(name)) for name in names if name not in shown}
+    return {name: _signed(outcome.get(name)) for name in names if name not in shown}
 
 
 def _mark_row(mark: dict[str, Any]) -> dict[str, Any]:
@@ -175,9 +175,8 @@ def _pair(values: list[float | None]) -> str:
     return ", ".join("-" if value is None else f"{value:.2f}" for value in values)
 
 
-def _rounded(value: Any) -> Any:
-    if isinstance(value, float):
-        return f"{value:.3f}"
+def _signed(value: Any) -> Any:
+    """Lists of numbers with their signs, which are directions; other values as they are."""
     if isinstance(value, list):
         return ", ".join(f"{number:+.3f}" for number in value)
     return value

@@ -8,14 +8,14 @@ import typer
 
 from amers.app.cli.image_production import WorkOptions
 from amers.app.cli.options import Shown
-from amers.app.cli.output import AsJson, show_one
+from amers.app.cli.output import AsJson, Row, show_one
 from amers.app.cli.production_rows import effort_row
 from amers.app.cli.progress import shown_progress
 from amers.app.errors import InputError
 from amers.app.usecases.executors import ComputeOptions
 from amers.app.usecases.image_production import WorkPlace
 from amers.app.usecases.surface import SurfaceFiles, run_surface
-from amers.app.usecases.surface_difference import write_surface_difference
+from amers.app.usecases.surface_difference import SurfaceDifference, write_surface_difference
 from amers.app.usecases.surface_points import write_surface_points
 from amers.services.surface.options import MOST_FILL_CELLS, SurfaceOptions
 
@@ -146,7 +146,24 @@ def difference(
     """
     with shown_progress() as progress:
         found = write_surface_difference(earlier, later, output, align=align, progress=progress)
-    show_one(asdict(found), as_json=as_json)
+    show_one(asdict(found) if as_json else _difference_row(found), as_json=as_json)
+
+
+def _difference_row(found: SurfaceDifference) -> Row:
+    """A difference for people, with axes and units."""
+    row = asdict(found)
+    words = {
+        "shift in x, y, height (m)": row.pop("shift_m"),
+        "sigma of the shift in x, y, height (m)": row.pop("shift_sigma_m"),
+        "aligned_cells": row.pop("aligned_cells"),
+        "moved_horizontally": "yes" if row.pop("moved_horizontally") else "no",
+        "cells with both heights (%)": 100.0 * row.pop("known"),
+        "median of the differences (m)": row.pop("median_m"),
+        "NMAD of the differences (m)": row.pop("nmad_m"),
+        "spread of the differences (sigmas)": row.pop("spread"),
+        "cells that changed by more than 3 sigmas (%)": 100.0 * row.pop("changed"),
+    }
+    return row | words
 
 
 def _range(text: str) -> tuple[float, float]:

@@ -60,7 +60,7 @@ def test_a_list_on_a_pipe_has_a_header_and_one_line_a_record(run):
 
 
 def test_the_extent_of_a_block_is_a_box_that_a_query_takes(run):
-    shown = dict(line.split(None, 1) for line in run("block", "show", "calanques").splitlines())
+    shown = dict(re.split("  +", line) for line in run("block", "show", "calanques").splitlines())
     box = json.loads(run("block", "show", "calanques", "--json"))["extent"]
     assert shown["extent"] == ",".join(f"{value:.6f}" for value in box)
     found = run("points", "query", "--bbox", shown["extent"], "--format", "csv").splitlines()

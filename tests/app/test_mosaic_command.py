@@ -134,7 +134,9 @@ def test_the_command_tells_steps_and_scenes(images: tuple[Path, ...], tmp_path: 
     assert record["seam_step"]["found"] > 10
     assert {tuple(pair["scenes"]) for pair in record["pairs"]} >= {("scene_0", "scene_1")}
     done = amers_here(words, {"PATH": ""})
-    assert "seam_step  median 0.0" in done.stdout
+    shown = {line.partition("  ")[0]: line for line in done.stdout.splitlines()}
+    assert " median 0.0" in shown["seam step"]
+    assert "pixel size (m)" in shown
 
 
 def test_registered_scenes_fit_where_delivered_ones_do_not(tmp_path: Path) -> None:
