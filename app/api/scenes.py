@@ -22,8 +22,9 @@ from amers.app.api.deps import (
 )
 from amers.app.api.files import file_reply, validators
 from amers.app.api.models import scenes as models
-from amers.app.api.models.base import stated_accuracy
+from amers.app.api.models.base import Link, stated_accuracy
 from amers.app.api.models.scenes import Scene, Scenes, StoredFile
+from amers.app.api.negotiation import JSON
 from amers.app.api.routes import CallerRoute
 from amers.app.api.sent_body import sent_chunks
 from amers.app.db.scene_registrations import SceneRegistration
@@ -146,15 +147,22 @@ def refer_to_scene(
 @router.get("/scenes")
 def list_scenes(
     *,
+    request: Request,
     database: DatabaseDep,
     caller: Registrar,
-    limit: Annotated[int, Query(ge=1, le=MOST_LISTED, description="Number of scenes.")] = 100,
+    limit: Annotated[int, Query(ge=1, le=MOST_LISTED, description="Number of scenes on a page.")] = 100,
+    after: Annotated[UUID | None, Query(description="From the link `next`.")] = None,
 ) -> Scenes:
     """List the scenes of the caller, newest first; administrators see all scenes."""
     with database.reading() as connection:
-        rows = scenes.list_scenes(connection, caller, limit)
-        last = scenes.registrations_of(connection, caller, rows, 1)
-    return Scenes(scenes=[_scene(row, last.get(row.id, ())) for row in rows])
+        listed = scenes.list_scenes(connection, caller, limit + 1, after)
+        page = listed[:limit]
+        last = scenes.registrations_of(connection, caller, page, 1)
+    links = [Link(rel="self", href=str(request.url), type=JSON)]
+    if len(listed) > limit:
+        following = str(request.url.include_query_params(after=page[-1].id))
+        links.append(Link(rel="next", href=following, type=JSON))
+    return Scenes(scenes=[_scene(row, last.get(row.id, ())) for row in page], links=links)
 
 
 @router.get("/scenes/{scene_id}")

@@ -18,6 +18,7 @@ from sqlalchemy import (
     insert,
     literal,
     select,
+    tuple_,
     update,
 )
 from sqlalchemy.dialects.postgresql import JSONB
@@ -199,11 +200,21 @@ def find_scene(connection: Connection, scene_id: UUID) -> SceneRow | None:
     return first(SceneRow, connection.execute(select(*COLUMNS).where(scene.c.id == scene_id)))
 
 
-def newest_scenes(connection: Connection, owner: UUID | None, limit: int) -> list[SceneRow]:
-    """The last scenes of an owner, or of everybody for None; the newest first."""
-    statement = select(*COLUMNS).order_by(scene.c.created_at.desc(), scene.c.id).limit(limit)
+def newest_scenes(
+    connection: Connection, owner: UUID | None, limit: int, after: UUID | None = None
+) -> list[SceneRow]:
+    """The last scenes of an owner, or of everybody for None; the newest first.
+
+    Args:
+        after: the page starts behind this scene.
+    """
+    statement = select(*COLUMNS).order_by(scene.c.created_at.desc(), scene.c.id.desc()).limit(limit)
     if owner is not None:
         statement = statement.where(scene.c.owner == owner)
+    if after is not None:
+        last = scene.alias("last")
+        key = select(last.c.created_at, last.c.id).where(last.c.id == after).scalar_subquery()
+        statement = statement.where(tuple_(scene.c.created_at, scene.c.id) < key)
     return every(SceneRow, connection.execute(statement))
 
 

@@ -325,9 +325,17 @@ def file_key(connection: Connection, caller: Token, scene_id: UUID, name: str) -
     return f"{folder_of(scene_id)}/{name}"
 
 
-def list_scenes(connection: Connection, caller: Token, limit: int) -> list[SceneRow]:
-    """The newest scenes that the caller may see: owners see their own, administrators all."""
-    return scenes.newest_scenes(connection, owner_filter(caller), limit)
+def list_scenes(
+    connection: Connection, caller: Token, limit: int, after: UUID | None = None
+) -> list[SceneRow]:
+    """The caller's newest scenes, or those that follow scene `after`; administrators see all scenes.
+
+    Raises:
+        NotFound: the caller may not see the scene `after`.
+    """
+    if after is not None:
+        visible_scene(connection, caller, after)
+    return scenes.newest_scenes(connection, owner_filter(caller), limit, after)
 
 
 def registrations_of(

@@ -23,7 +23,7 @@ from amers.app.usecases.installation import Installation
 from amers.app.usecases.scenes import SentFile, clean_name, folder_of, upload_scene
 from amers.app.usecases.tokens import create_token
 from amers.app.worker.sweep import sweep_files
-from tests.app.callers import Bearer
+from tests.app.callers import Bearer, Caller
 from tests.app.conftest import stored_files
 from tests.app.running_service import running_service
 from tests.app.worker_processes import wait_until
@@ -45,6 +45,28 @@ def chunks(data: bytes) -> Iterator[bytes]:
         yield data[start : start + 10_000]
 
 
+def test_pages_of_scenes_have_every_scene_once(
+    client: TestClient, me: Caller, bearer: Bearer, connection: Connection
+):
+    """Two scenes of the same instant fall on different pages, and a new one on none of those to come."""
+    mine = {me.scene(TIFF[:9]) for _ in range(5)}
+    foreign = bearer("register").scene(TIFF[:9])
+    run_sql(connection, "update scene set created_at = date_trunc('day', created_at)")
+    connection.commit()
+    pages, path = [], "/scenes?limit=2"
+    while path:
+        page = me.get(path).json()
+        pages.append([scene["id"] for scene in page["scenes"]])
+        following = [link["href"] for link in page["links"] if link["rel"] == "next"]
+        path = following[0] if following else ""
+        assert not path or "limit=2" in path
+        me.scene(TIFF[:9])
+    assert [len(page) for page in pages] == [2, 2, 1]
+    assert pages[0] + pages[1] + pages[2] == sorted(mine, reverse=True)
+    assert me.get(f"/scenes?after={foreign}").status_code == 404
+    assert me.get("/scenes?after=scene").status_code == 400
+
+
 def test_an_uploaded_scene_is_stored_as_it_was_sent(
     client: TestClient, bearer: Bearer, storage: Storage
 ):
@@ -55,7 +77,7 @@ def test_an_uploaded_scene_is_stored_as_it_was_sent(
     assert (scene["state"], scene["file"], scene["sigma_m"]) == ("uploaded", "IMG_1.TIF", 12.5)
     assert (scene["size_bytes"], scene["sha256"]) == (len(TIFF), hashlib.sha256(TIFF).hexdigest())
     assert me.get(reply.headers["location"]).json() == scene
-    assert me.get("/scenes").json() == {"scenes": [scene]}
+    assert me.get("/scenes").json()["scenes"] == [scene]
     assert storage.path(f"scenes/{scene['id']}/IMG_1.TIF").read_bytes() == TIFF
 
 
@@ -94,7 +116,7 @@ def test_a_file_that_is_no_image_is_refused_and_leaves_nothing(
     reply = me.post("/scenes?name=a.tif", content=body)
     assert reply.status_code == 422
     assert "neither TIFF, JPEG 2000 nor NITF" in reply.json()["detail"]
-    assert me.get("/scenes").json() == {"scenes": []}
+    assert me.get("/scenes").json()["scenes"] == []
     assert stored_files(storage) == []
 
 
@@ -105,7 +127,7 @@ def test_an_upload_announced_too_large_is_refused_before_it_is_read(
     size = {"Content-Length": str(LIMIT_BYTES + 1)}
     reply = client.post("/scenes?name=a.tif", content=b"II*\0", headers=me | size)
     assert reply.status_code == 413
-    assert me.get("/scenes").json() == {"scenes": []}
+    assert me.get("/scenes").json()["scenes"] == []
     assert stored_files(storage) == []
 
 
@@ -117,7 +139,7 @@ def test_an_upload_that_turns_out_too_large_is_cut_off_and_leaves_nothing(
     reply = me.post("/scenes?name=a.tif", content=body)
     assert reply.status_code == 413
     assert str(LIMIT_BYTES) in reply.json()["detail"]
-    assert me.get("/scenes").json() == {"scenes": []}
+    assert me.get("/scenes").json()["scenes"] == []
     assert stored_files(storage) == []
 
 
@@ -191,7 +213,7 @@ def test_a_scene_of_another_owner_is_not_found(client: TestClient, bearer: Beare
         stranger.put(f"{here}/files/a_RPC.TXT", content=b"x"),
     ]
     assert [reply.status_code for reply in replies] == [404, 404, 404]
-    assert stranger.get("/scenes").json() == {"scenes": []}
+    assert stranger.get("/scenes").json()["scenes"] == []
     assert storage.keys("scenes") == [f"scenes/{scene['id']}/a.tif"]
     assert bearer("admin").get(here).status_code == 200
 
@@ -309,7 +331,7 @@ def test_an_upload_survives_no_failure_of_the_database(settings: Settings, beare
         reply = client.post("/scenes?name=a.tif", content=TIFF, headers=me)
         assert reply.status_code == 500
         assert stored_files(Storage(settings.data_folder / "storage")) == []
-        assert client.get("/scenes", headers=me).json() == {"scenes": []}
+        assert client.get("/scenes", headers=me).json()["scenes"] == []
 
 
 @pytest.mark.thorough

@@ -211,7 +211,7 @@ def test_a_scene_whose_commit_fails_leaves_nothing_and_can_be_sent_again(
     with at_commit(dsn, "scene", CUT):
         reply = client.post("/scenes?name=a.tif", content=TIFF, headers=me)
         assert reply.status_code == 503, reply.text
-    assert client.get("/scenes", headers=me).json() == {"scenes": []}
+    assert client.get("/scenes", headers=me).json()["scenes"] == []
     assert storage.keys("scenes") == []
     assert client.post("/scenes?name=a.tif", content=TIFF, headers=me).status_code == 201
 

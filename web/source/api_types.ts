@@ -608,6 +608,7 @@ export interface SceneRegistration {
 
 export interface Scenes {
   scenes: Scene[];
+  links: Link[];
 }
 
 export type Scope = "read" | "register" | "monitor" | "admin";

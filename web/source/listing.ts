@@ -1,6 +1,7 @@
 // A list that is sorted, filtered and shown page by page.
 
-import { fill, h, plural } from "./elements";
+import { fill, h, plural, problem } from "./elements";
+import type { Following } from "./following";
 
 const PAGE = 20;
 /** Lists with fewer rows are seen as a whole: they have no controls. */
@@ -13,6 +14,8 @@ export interface Listing<Row> {
   /** What the list has, in the singular, such as "scene". */
   what: string;
   rows: Row[];
+  /** Reads the rows that follow; null where these are all. */
+  following?: Following<Row> | null;
   /** By the words of the choice; the first is that of the list at first. */
   orders: Record<string, Order<Row>>;
   element: (row: Row) => HTMLElement;
@@ -21,7 +24,7 @@ export interface Listing<Row> {
 }
 
 /** The list with its controls; what it is filtered by are the words of its rows. */
-export function listing<Row>({ what, rows, orders, element, empty }: Listing<Row>): HTMLElement {
+export function listing<Row>({ what, rows, following, orders, element, empty }: Listing<Row>): HTMLElement {
   if (!rows.length) return empty;
   const made = rows.map((row) => ({ row, element: element(row) }));
   const list = h("ul", { class: "list story", "aria-label": `List of ${what}s` });
@@ -39,9 +42,31 @@ export function listing<Row>({ what, rows, orders, element, empty }: Listing<Row
     order,
   );
   const pager = h("p", { class: "state" }, before, after);
+  const older = h("button", { type: "button", onclick: () => void load() }, `Load older ${what}s`);
+  const rest = h("p", { class: "state", hidden: !following }, older);
   let page = 0;
   show(0);
-  return h("div", {}, controls, count, list, pager);
+  return h("div", {}, controls, count, list, pager, rest);
+
+  /** Reads the rows that follow; the view stays where it is. */
+  async function load(): Promise<void> {
+    if (!following) return;
+    older.disabled = true;
+    rest.querySelector(".problem")?.remove();
+    try {
+      const read = await following();
+      made.push(...read.rows.map((row) => ({ row, element: element(row) })));
+      following = read.following;
+      controls.hidden = made.length < FEWEST_WITH_CONTROLS;
+      show(page);
+      rest.hidden = !following;
+      if (rest.hidden && !after.disabled) after.focus();
+    } catch (error) {
+      rest.append(problem(error));
+    } finally {
+      older.disabled = false;
+    }
+  }
 
   function turn(by: number): void {
     show(page + by);
@@ -64,7 +89,8 @@ export function listing<Row>({ what, rows, orders, element, empty }: Listing<Row
     pager.hidden = sorted.length <= PAGE;
     count.hidden = controls.hidden;
     const part = sorted.length > PAGE ? `${from + 1} to ${to} of ${plural(sorted.length, what)}` : plural(sorted.length, what);
-    count.textContent = sorted.length ? part : `No ${what} has these words. Shorten the filter.`;
+    const newest = following ? `${part}, the newest of all` : part;
+    count.textContent = sorted.length ? newest : `No ${what} has these words. Shorten the filter.`;
   }
 }
 

@@ -2,9 +2,10 @@
 
 import type { FeatureCollection, Geometry, Point, Position } from "geojson";
 import { BASE, get } from "./api";
-import type { PointWithViews, Reference, References, Scenes, StatusInfo } from "./api_types";
+import type { PointWithViews, Reference, References, Scene, StatusInfo } from "./api_types";
 import type { Bounds, Patch, Picture, Pyramid } from "./comparison";
 import { figure } from "./elements";
+import { everyRow } from "./following";
 import { metresPerDegree } from "./ground";
 import { drawn, stateText } from "./processes";
 import type { PointResultProperties } from "./residuals";
@@ -93,7 +94,7 @@ export function boundsOf(positions: Position[]): Bounds {
 }
 
 async function registeredScenes(bounds: Bounds, registration: StatusInfo, signal: AbortSignal): Promise<{ id: string; name: string; job: string }[]> {
-  const { scenes } = await get<Scenes>("scenes?limit=1000", signal);
+  const scenes = await everyRow<"scenes", Scene>("scenes?limit=1000", "scenes", signal);
   const there = scenes.filter(({ id, footprint, removed }) => !removed && id !== registration.inputs["scene"] && meet(boundsOf(positionsIn(footprint)), bounds));
   return there.flatMap(({ id, name, registrations: [last] }) =>
     last?.outcome === "registered" && last.process === "register-scene" ? [{ id, name, job: last.job }] : [],

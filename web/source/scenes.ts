@@ -3,8 +3,9 @@
 import type { Feature } from "geojson";
 import { register, registrationForm } from "./again";
 import { get } from "./api";
-import type { Jobs, Scene, SceneRegistration, Scenes, StatedAccuracy, StatusInfo } from "./api_types";
+import type { Scene, SceneRegistration, StatedAccuracy, StatusInfo } from "./api_types";
 import { accuracy, badge, bytes, day, facts, figure, fill, h, problem, when } from "./elements";
+import { type Following, pageOf } from "./following";
 import { listing, type Order } from "./listing";
 import { go } from "./page";
 import { place as placeName } from "./places";
@@ -25,10 +26,11 @@ export const showScenes: ShowView = async (place) => {
     );
     return;
   }
-  const [{ scenes }, { jobs }] = await Promise.all([
-    get<Scenes>(`scenes?limit=${MOST_SCENES}`, signal),
-    get<Jobs>(`jobs?limit=${MOST_JOBS}`, signal),
+  const [first, jobs] = await Promise.all([
+    pageOf<"scenes", Scene>(`scenes?limit=${SCENES_OF_A_PAGE}`, "scenes", signal),
+    pageOf<"jobs", StatusInfo>(`jobs?limit=${JOBS_OF_A_PAGE}`, "jobs", signal),
   ]);
+  const scenes = [...first.rows];
   await atlas.show("scenes", outlines(scenes));
   if (!atlas.went) atlas.fit({ type: "FeatureCollection", features: outlines(scenes) }, CLOSEST_OF_MANY);
   fill(
@@ -36,17 +38,26 @@ export const showScenes: ShowView = async (place) => {
     h("h1", { tabindex: -1 }, "Scenes"),
     uploadForm(place),
     h("h2", {}, "Jobs"),
-    listing({ what: "job", rows: jobs, orders: JOB_ORDERS, element: jobRow, empty: next("No jobs yet. Choose an image above and press Upload and register: the registration is a job.") }),
-    jobs.length === MOST_JOBS ? h("p", { class: "quiet" }, `These are the newest ${MOST_JOBS} jobs. The results of older ones are at their scenes.`) : null,
+    listing({ what: "job", ...jobs, orders: JOB_ORDERS, element: jobRow, empty: next("No jobs yet. Choose an image above and press Upload and register: the registration is a job.") }),
     h("h2", {}, "My scenes"),
-    listing({ what: "scene", rows: scenes, orders: SCENE_ORDERS, element: sceneRow, empty: next("No scenes yet. Choose an image above, or send one with amers scene register IMAGE --server.") }),
-    scenes.length === MOST_SCENES ? h("p", { class: "quiet" }, `These are the newest ${MOST_SCENES} scenes.`) : null,
+    listing({ what: "scene", rows: first.rows, following: drawn(first.following), orders: SCENE_ORDERS, element: sceneRow, empty: next("No scenes yet. Choose an image above, or send one with amers scene register IMAGE --server.") }),
   );
+
+  /** Reads older scenes, and draws them on the map. */
+  function drawn(following: Following<Scene> | null): Following<Scene> | null {
+    if (!following) return null;
+    return async () => {
+      const page = await following();
+      scenes.push(...page.rows);
+      await atlas.show("scenes", outlines(scenes));
+      return { rows: page.rows, following: drawn(page.following) };
+    };
+  }
 };
 
-const MOST_SCENES = 1000;
+const SCENES_OF_A_PAGE = 500;
 const CLOSEST_OF_MANY = 13;
-const MOST_JOBS = 200;
+const JOBS_OF_A_PAGE = 200;
 
 const SCENE_ORDERS: Record<string, Order<Scene>> = {
   "newest first": ({ created }) => -Date.parse(created),

@@ -4,7 +4,7 @@ from datetime import datetime
 from typing import Literal
 from uuid import UUID
 
-from amers.app.api.models.base import Reply, StatedAccuracy
+from amers.app.api.models.base import Link, Reply, StatedAccuracy
 from amers.app.api.models.features import AnyGeometry
 from amers.app.db.scene_registrations import RegistrationOutcome
 from amers.app.db.schema import SceneState, UploadPurpose
@@ -47,9 +47,10 @@ class Scene(Reply):
 
 
 class Scenes(Reply):
-    """Scenes, newest first."""
+    """A page of scenes, newest first."""
 
     scenes: list[Scene]
+    links: list[Link]
 
 
 class StoredFile(Reply):
