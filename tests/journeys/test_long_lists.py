@@ -4,6 +4,7 @@ import httpx
 import pytest
 from playwright.sync_api import Page, Route, expect
 
+from tests.journeys.conftest import Visit
 from tests.journeys.map_page import ARTEFACTS, assert_readable
 from tests.service_process import Service
 
@@ -33,7 +34,7 @@ def in_short_pages(page: Page, path: str) -> None:
 
 
 def test_the_list_of_scenes_loads_older_ones_until_the_last(
-    visit, service: Service, secret: str, seven_scenes: None
+    visit: Visit, service: Service, secret: str, seven_scenes: None
 ) -> None:
     page = visit("", secret)
     in_short_pages(page, "scenes")
@@ -56,7 +57,7 @@ def test_the_list_of_scenes_loads_older_ones_until_the_last(
 
 
 def test_a_page_that_does_not_arrive_can_be_asked_for_again(
-    visit, service: Service, secret: str, seven_scenes: None
+    visit: Visit, service: Service, secret: str, seven_scenes: None
 ) -> None:
     page = visit("", secret, refused=503)
     in_short_pages(page, "scenes")
