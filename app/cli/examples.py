@@ -7,23 +7,28 @@ EXAMPLES: Mapping[str, tuple[str, str]] = {
     "block list": ("", "--json"),
     "block show": ("my-block", "my-block@2 --json"),
     "block publish": ("my-block", "my-block@2"),
-    "block restore": ("my-block@1", "7"),
+    "block restore": ("my-block@1", "2"),
     "block prioritise": ("my-block 10", "my-block@2 0"),
     "block withdraw": ("my-block", "my-block@1"),
-    "block delete": ("my-block@1", "7"),
+    "block delete": ("my-block@1", "my-block@2"),
     "block export": (
-        "--bbox 5.3,43.2,5.5,43.4 -o exported",
-        "--bbox 5.3,43.2,5.5,43.4 --id coast --title Coast -o exported",
+        "--bbox 5.3,43.5,5.5,43.7 -o exported",
+        "--bbox 5.3,43.5,5.5,43.7 --id coast --title Coast -o exported",
     ),
     "block quality": ("my-block --site ortho.tif -o quality", "my-block --points-per-km2 1 --ce90-m 3"),
-    "block renew": ("my-block --image scene.tif", "my-block --image scene.tif --version 3"),
+    "block renew": (
+        "my-block --image first.tif",
+        "my-block --image first.tif --image second.tif --version 4",
+    ),
     "block frame": (
-        "my-block --images a.tif --images b.tif --control marks.csv -o moved",
-        "my-block --images a.tif --images b.tif --control marks.csv --check check.csv -o moved",
+        "my-block --images a.tif --images b.tif --control marks.csv --control-frame-sigma-m 0.05,0.05 "
+        "-o moved",
+        "my-block --images a.tif --images b.tif --control marks.csv --control-frame-sigma-m 0.05,0.05 "
+        "--check check.csv -o moved",
     ),
     "base make": (
         "--bbox 5.9 43.5 6.1 43.7 --from sentinel-2 --catalogue https://stac.example.org -o base --plan",
-        "--area region.geojson --from sentinel-2 --catalogue mirror --publish -o base",
+        "--area region.geojson --from sentinel-2 --catalogue mirror --work base.work --publish -o base",
     ),
     "base update": ("base.work -o base-2", "base.work -o base-2 --new-dates 4"),
     "points intersect": (
@@ -32,15 +37,15 @@ EXAMPLES: Mapping[str, tuple[str, str]] = {
     ),
     "points experiment": (
         "marks.csv --images a.tif --images b.tif",
-        "marks.csv --images a.tif --images b.tif --control-points 4,8 --draws 200",
+        "marks.csv --images a.tif --images b.tif --control-points 4,8 --draws 10",
     ),
     "points reach": (
-        "marks.csv --images a.tif --images b.tif --site-frame-sigma-m 0.5,1",
-        "marks.csv --images a.tif --images b.tif --site-frame-sigma-m 0.5,1 --json",
+        "north.csv south.csv --images a.tif --images b.tif --site-frame-sigma-m 0.5,1",
+        "north.csv south.csv --images a.tif --images b.tif --site-frame-sigma-m 0.5,1 --json",
     ),
     "points query": (
-        "--bbox 5.3,43.2,5.5,43.4 -o points.gpkg",
-        "--bbox 5.3,43.2,5.5,43.4 --server https://gcp.example.org --json",
+        "--bbox 5.3,43.5,5.5,43.7 -o points.gpkg",
+        "--bbox 5.3,43.5,5.5,43.7 --server https://gcp.example.org --json",
     ),
     "points suspensions": ("", "--json"),
     "points suspend": ("42 --because 'the house is gone'", "42 --because 'under water' --json"),
@@ -94,18 +99,18 @@ EXAMPLES: Mapping[str, tuple[str, str]] = {
         "catalogue.json --area region.geojson -o selection",
         "https://stac.example.org --area region.geojson --since 2024-01-01 -o selection",
     ),
-    "production plan": ("plan.json -o plan", "plan.json -o plan --json"),
+    "production plan": ("configuration.json -o plan", "configuration.json -o plan --json"),
     "production run": (
         "a.tif b.tif c.tif -o my-block",
-        "a.tif b.tif --gsd-m 0.5,2 --sigma-m 5 --control marks.csv -o my-block",
+        "a.tif b.tif --sigma-m 5 --control marks.csv --control-frame-sigma-m 0.05,0.05 -o my-block",
     ),
     "production points": (
-        "points.csv --images ortho.tif -o my-block",
+        "points.csv --images ortho.tif --sigma-m 1 -o my-block",
         "points.csv --chips chips --frame-sigma-m 1 -o my-block",
     ),
     "production ortho": (
         "june.tif may.tif --dem heights.tif --vertical EGM2008 --sigma-m 3 -o my-block",
-        "ortho.tif --height-m 50 --spacing-m 500 --sigma-m 3 -o my-block",
+        "ortho.tif --height-m 50 --height-sigma-m 5 --spacing-m 30 --sigma-m 3 -o my-block",
     ),
     "db upgrade": ("", "--json"),
     "db status": ("", "--json"),

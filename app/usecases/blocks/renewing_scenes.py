@@ -175,8 +175,8 @@ def _usable(row: RegistrationRow | None, block: Block, name: str) -> Registratio
     """A registration that can renew a block."""
     if row is None:
         raise InputError(
-            f"{name}: no registration on control points of the store is known; register it first "
-            "(amers scene register)"
+            f"{name}: no registration on the points of the store is known; register it there first "
+            "(amers scene register, without --block)"
         )
     used = [f"{one['id']}@{one['version']}" for one in row.block_versions]
     if block.id not in [one["id"] for one in row.block_versions]:
