@@ -46,7 +46,7 @@ READER = Reader(
     "Masks and land cover of the ground",
     ("read_ground_mask", "read_land_cover"),
     (
-        Treatment(Subject.HORIZONTAL_DATUM, "used", "The reference system of an image on a map."),
+        Treatment(Subject.HORIZONTAL_DATUM, "used", "An image on a map states its reference system."),
         Treatment(Subject.HORIZONTAL_DATUM, "assumed", "Polygons in GeoJSON are in WGS 84."),
         Treatment(
             Subject.HORIZONTAL_DATUM,
@@ -57,7 +57,8 @@ READER = Reader(
         Treatment(
             Subject.VALIDITY,
             "used",
-            "Nodata pixels: their ground is not excluded, and their land cover is unknown.",
+            "The image has nodata pixels: their ground is not excluded, and their land "
+            "cover is unknown.",
         ),
         Treatment(
             Subject.BANDS,
@@ -72,7 +73,7 @@ READER = Reader(
         Treatment(
             Subject.IDENTITY,
             "named",
-            "The properties of the polygons, because all polygons are excluded.",
+            "Polygons have properties. Amers excludes all polygons.",
         ),
     ),
     (

@@ -8,27 +8,31 @@ _OF_MAP = (
     Treatment(
         Subject.HORIZONTAL_DATUM,
         "used",
-        "The reference system of the file. Positions are transformed with the operation that PROJ "
-        "selects for the middle of the file; the report names this operation and its accuracy.",
+        "The file states its reference system. Amers transforms positions with the "
+        "operation that PROJ selects for the middle of the file. The report names "
+        "this operation and its accuracy.",
     ),
     Treatment(
         Subject.HORIZONTAL_DATUM,
         "assumed",
-        "A system without a named datum, on the ellipsoid of WGS 84 or GRS 1980, is used as WGS 84.",
+        "The system has no named datum, but the ellipsoid of WGS 84 or GRS 1980: "
+        "Amers uses it as WGS 84.",
     ),
     Treatment(
         Subject.HORIZONTAL_DATUM,
         "refused",
-        "A system without a usable transformation to WGS 84, such as a system on another ellipsoid "
-        "without a named datum.",
+        "The system has no usable transformation to WGS 84, for example because it "
+        "has no named datum and another ellipsoid.",
     ),
 )
 _EPOCH = Treatment(
-    Subject.EPOCH, "named", "The epoch of the coordinates. Positions are used as current WGS 84."
+    Subject.EPOCH,
+    "named",
+    "The file states an epoch of the coordinates. Amers uses the positions as current WGS 84.",
 )
 _SCALE = (
-    "The unit of the band, otherwise the unit of the vertical system: US survey foot, ft, cm and "
-    "others. Scale and offset are applied."
+    "The band, or otherwise the vertical system, states the unit, such as US "
+    "survey foot, ft or cm. Amers also applies scale and offset of the band."
 )
 _UNIT = (
     Treatment(Subject.UNIT, "used", _SCALE),
@@ -37,31 +41,37 @@ _UNIT = (
         "assumed",
         "Heights are in metres if neither the band nor the vertical system states a unit.",
     ),
-    Treatment(
-        Subject.UNIT, "named", "The unit of the vertical system, if the band states another unit."
-    ),
+    Treatment(Subject.UNIT, "named", "The vertical system states another unit than the band."),
     Treatment(Subject.UNIT, "refused", "The stated unit is not a unit of length."),
 )
 _VERTICAL = (
     Treatment(
-        Subject.VERTICAL_DATUM, "used", "The vertical system of the file, or the datum that you state."
+        Subject.VERTICAL_DATUM, "used", "The file or you (`--vertical`) state the vertical datum."
     ),
     Treatment(
         Subject.VERTICAL_DATUM,
         "assumed",
-        "Ellipsoidal heights in a national system are above the WGS 84 ellipsoid, as GNSS gives them. A "
-        "system with three axes is the exception: it states its own ellipsoid.",
+        "Heights in a national system are ellipsoidal: Amers assumes heights above "
+        "the WGS 84 ellipsoid, as from GNSS. A system with three axes is the "
+        "exception, because it states its own ellipsoid.",
     ),
     Treatment(
         Subject.VERTICAL_DATUM,
         "refused",
-        "No datum is stated, you state another datum than the file, or the datum counts depths.",
+        "No datum is stated, you state another datum than the file, or the datum is one of depths.",
     ),
 )
 _VALIDITY = (
-    Treatment(Subject.VALIDITY, "used", "Nodata value, mask or alpha band, as GDAL uses them."),
     Treatment(
-        Subject.VALIDITY, "assumed", "Voids are -9999 and heights that do not occur on the Earth."
+        Subject.VALIDITY,
+        "used",
+        "A nodata value, a mask or an alpha band states which heights are valid. "
+        "Amers uses it as GDAL does.",
+    ),
+    Treatment(
+        Subject.VALIDITY,
+        "assumed",
+        "Heights of -9999, and heights that do not occur on the Earth, are voids.",
     ),
 )
 
@@ -72,10 +82,19 @@ TERRAIN_READER = Reader(
         *_OF_MAP,
         *_VERTICAL,
         *_UNIT,
-        Treatment(Subject.PLACE, "used", "`.aux.xml` files and world files, as for images."),
-        Treatment(Subject.PIXEL_ORIGIN, "used", "AREA_OR_POINT, as GDAL uses it."),
+        Treatment(
+            Subject.PLACE,
+            "used",
+            "An `.aux.xml` file or a world file states the map grid, as for images.",
+        ),
+        Treatment(
+            Subject.PIXEL_ORIGIN,
+            "used",
+            "AREA_OR_POINT states whether a value is for a pixel area or a point. Amers "
+            "uses it as GDAL does.",
+        ),
         *_VALIDITY,
-        Treatment(Subject.BANDS, "named", "All bands except the first."),
+        Treatment(Subject.BANDS, "named", "The file has further bands. Amers reads the first band."),
         Treatment(Subject.BANDS, "refused", "The band has a palette of colours."),
         _EPOCH,
     ),
@@ -88,7 +107,7 @@ GRID_READER = Reader(
         Treatment(
             Subject.HORIZONTAL_DATUM,
             "used",
-            "The system of the format, of the header, or of the `.prj` file next to the image.",
+            "The format, the header or the `.prj` file states the system.",
         ),
         Treatment(
             Subject.HORIZONTAL_DATUM,
@@ -98,29 +117,32 @@ GRID_READER = Reader(
         Treatment(
             Subject.VERTICAL_DATUM,
             "used",
-            "The datum that you state, or a vertical system in the `.prj` file.",
+            "You (`--vertical`) or the `.prj` file state the vertical datum.",
         ),
         Treatment(
             Subject.VERTICAL_DATUM,
             "assumed",
-            "Heights of `.hgt` and DTED are above EGM96, as the documents of these formats say.",
+            "The format is `.hgt` or DTED: heights are above EGM96, as the specifications"
+            " of these formats state.",
         ),
-        Treatment(Subject.VERTICAL_DATUM, "refused", "No datum is stated, in the other formats."),
         Treatment(
-            Subject.UNIT, "used", "The unit of the format, or of the `.aux.xml` file next to the image."
+            Subject.VERTICAL_DATUM, "refused", "The file has another format, and no datum is stated."
         ),
+        Treatment(Subject.UNIT, "used", "The format, or the `.aux.xml` file, states the unit."),
         Treatment(Subject.UNIT, "assumed", "Heights are in metres."),
         Treatment(
             Subject.PLACE,
             "used",
-            "The name of an `.hgt` file states its place; there is a node in each corner.",
+            "The name of an `.hgt` file states its position. There is a height node in each corner.",
         ),
-        Treatment(Subject.PLACE, "refused", "The name of an `.hgt` file states no place."),
-        Treatment(Subject.PIXEL_ORIGIN, "used", "The nodes of `.hgt` and DTED are points."),
+        Treatment(Subject.PLACE, "refused", "The name of an `.hgt` file states no position."),
+        Treatment(
+            Subject.PIXEL_ORIGIN, "used", "The format is `.hgt` or DTED: the height nodes are points."
+        ),
         Treatment(
             Subject.PIXEL_ORIGIN,
             "assumed",
-            "In the other formats, the definition of their headers decides.",
+            "The file has another format: the definition of its header states the pixel origin.",
         ),
         *_VALIDITY,
     ),
@@ -133,15 +155,19 @@ TILES_READER = Reader(
         Treatment(
             Subject.HORIZONTAL_DATUM,
             "used",
-            "Each tile is used in its own system, also if the system differs from that of the finest "
-            "tile.",
+            "Each tile states its system. Amers uses each tile in its own system, also if"
+            " the systems differ.",
         ),
-        Treatment(Subject.VERTICAL_DATUM, "used", "The datum of the tiles, or of the sources of a VRT."),
+        Treatment(
+            Subject.VERTICAL_DATUM,
+            "used",
+            "The tiles, or the sources of a VRT, state the vertical datum.",
+        ),
         Treatment(Subject.VERTICAL_DATUM, "refused", "The tiles have different vertical datums."),
         Treatment(
             Subject.UNIT,
             "used",
-            "The unit of each tile; for a VRT without units, the unit of its sources.",
+            "Each tile states its unit. For a VRT without units, its sources state the unit.",
         ),
         Treatment(Subject.UNIT, "refused", "The sources of a VRT have different units or scales."),
         Treatment(
@@ -149,9 +175,11 @@ TILES_READER = Reader(
             "refused",
             "A VRT refers to files outside its folder or computes values, or a tile is missing.",
         ),
-        Treatment(Subject.PIXEL_ORIGIN, "used", "The pixel origin of each tile."),
+        Treatment(Subject.PIXEL_ORIGIN, "used", "Each tile states its pixel origin."),
         Treatment(
-            Subject.VALIDITY, "used", "Voids of one tile are filled with heights of the next tile."
+            Subject.VALIDITY,
+            "used",
+            "Each tile states its voids. Amers fills voids of one tile with heights of the next tile.",
         ),
         Treatment(
             Subject.IDENTITY, "refused", "Two files show the same ground, such as heights and a mask."
@@ -166,12 +194,13 @@ GEOID_READER = Reader(
         Treatment(
             Subject.VERTICAL_DATUM,
             "used",
-            "A path names the grid. A name alone is enough for a grid in the folders of PROJ.",
+            "You name the grid with `--geoid`: by a path, or by the file name alone if "
+            "the grid is in a folder of PROJ.",
         ),
         Treatment(
             Subject.VERTICAL_DATUM,
             "named",
-            "The national datum of the heights, if you give a grid of a global geoid.",
+            "The heights have a national datum, but you name a grid of a global geoid.",
         ),
         Treatment(
             Subject.VERTICAL_DATUM,
@@ -190,11 +219,22 @@ MAP_READER = Reader(
         Treatment(
             Subject.VERTICAL_DATUM,
             "named",
-            "The vertical part of a compound system, because an image has no heights.",
+            "The image has a compound system with a vertical part. An image has no heights.",
         ),
-        Treatment(Subject.UNIT, "used", "The unit of the map, such as US survey feet."),
-        Treatment(Subject.PLACE, "used", "`.aux.xml` files and world files, as GDAL uses them."),
-        Treatment(Subject.PIXEL_ORIGIN, "used", "AREA_OR_POINT, as GDAL uses it."),
+        Treatment(
+            Subject.UNIT, "used", "The system of the map states the unit, such as US survey feet."
+        ),
+        Treatment(
+            Subject.PLACE,
+            "used",
+            "An `.aux.xml` file or a world file states the map grid. Amers uses it as GDAL does.",
+        ),
+        Treatment(
+            Subject.PIXEL_ORIGIN,
+            "used",
+            "AREA_OR_POINT states whether a value is for a pixel area or a point. Amers "
+            "uses it as GDAL does.",
+        ),
         _EPOCH,
     ),
     (*_NEVER, Subject.VALIDITY, Subject.BANDS, Subject.IDENTITY),

@@ -25,14 +25,16 @@ _FEET_IN_COMMENT = Treatment(
     Subject.UNIT, "refused", "A comment states that heights are in feet or in another unit than metres."
 )
 _EPOCH = Treatment(
-    Subject.EPOCH, "named", "An epoch in a comment. Each datum is used at its own reference epoch."
+    Subject.EPOCH,
+    "named",
+    "A comment states an epoch. Amers uses each datum at its own reference epoch.",
 )
-_ACCURACY = Treatment(Subject.ACCURACY, "named", "An accuracy in a comment.")
+_ACCURACY = Treatment(Subject.ACCURACY, "named", "A comment states an accuracy.")
 _FILE_NAMES = Treatment(
     Subject.IDENTITY,
     "used",
-    "Images are identified by their file names. Folder names are ignored, because they may be of "
-    "another computer.",
+    "The file names images. Amers identifies them by their file names and ignores"
+    " the folder names, which may be of another computer.",
 )
 _EXCHANGED = Treatment(
     Subject.ORDER,
@@ -60,14 +62,14 @@ ASP_READER = Reader(
         Treatment(
             Subject.ACCURACY,
             "used",
-            "The three sigmas of a ground position, if they are equal or if `--sigma-axes` states their "
-            "axes.",
+            "A ground position has three sigmas, and they are equal or `--sigma-axes` "
+            "states their axes.",
         ),
         Treatment(
             Subject.ACCURACY,
             "named",
-            "Unequal sigmas of a ground position without stated axes, and the tiny sigmas that mark "
-            "fixed points.",
+            "The three sigmas of a ground position differ, but their axes are not stated."
+            " Or the sigmas are tiny, which only marks a fixed point.",
         ),
         _EPOCH,
         _FILE_NAMES,
@@ -113,7 +115,7 @@ QGIS_READER = Reader(
         Treatment(
             Subject.ACCURACY,
             "named",
-            "The columns `dX`, `dY` and `residual`, which belong to a fit in QGIS.",
+            "The columns `dX`, `dY` and `residual` contain residuals of a fit in QGIS.",
         ),
         _EPOCH,
     ),
@@ -124,18 +126,18 @@ ENVI_READER = Reader(
     ("parse_envi_pts",),
     (
         Treatment(
-            Subject.HORIZONTAL_DATUM, "used", "`projection info` with Geographic or UTM, and WGS-84."
+            Subject.HORIZONTAL_DATUM, "used", "`projection info` states Geographic or UTM, and WGS-84."
         ),
         Treatment(
             Subject.HORIZONTAL_DATUM,
             "refused",
-            "`projection info` with another projection or datum, or a comment with another system.",
+            "`projection info` states another projection or datum, or a comment states another system.",
         ),
         _IN_COMMENT,
         _NO_DATUM,
-        Treatment(Subject.UNIT, "used", "`units` of the projection: degrees or metres."),
+        Treatment(Subject.UNIT, "used", "`units` of the projection states degrees or metres."),
         Treatment(Subject.UNIT, "assumed", "Elevations are in metres."),
-        Treatment(Subject.UNIT, "refused", "`units=Feet`, or a comment that states feet."),
+        Treatment(Subject.UNIT, "refused", "`units=Feet` or a comment states that the unit is feet."),
         Treatment(Subject.PIXEL_ORIGIN, "assumed", "The corner of the first pixel is (1, 1)."),
         _EXCHANGED,
         _ACCURACY,
@@ -147,9 +149,11 @@ PCI_READER = Reader(
     "PCI OrthoEngine text",
     ("parse_pci_text",),
     (
-        Treatment(Subject.HORIZONTAL_DATUM, "used", "`crs=` in the first line."),
+        Treatment(
+            Subject.HORIZONTAL_DATUM, "used", "`crs=` in the first line states the reference system."
+        ),
         _OTHER_BODY,
-        Treatment(Subject.VERTICAL_DATUM, "used", "`heights=` in the first line."),
+        Treatment(Subject.VERTICAL_DATUM, "used", "`heights=` in the first line states the datum."),
         _NO_DATUM,
         Treatment(Subject.UNIT, "assumed", "Heights are in metres."),
         _FEET_IN_COMMENT,
@@ -159,10 +163,15 @@ PCI_READER = Reader(
         Treatment(
             Subject.VALIDITY,
             "used",
-            "Column S: G is a control point, I is an inactive point, C is a check point.",
+            "The column S contains the kind of a point: G is a control point, I an "
+            "inactive point, C a check point.",
         ),
-        Treatment(Subject.VALIDITY, "refused", "Column S contains another letter."),
-        Treatment(Subject.ACCURACY, "named", "The columns eX, eY and eZ, which PCI defines in pixels."),
+        Treatment(Subject.VALIDITY, "refused", "The column S contains a letter other than G, I and C."),
+        Treatment(
+            Subject.ACCURACY,
+            "named",
+            "The columns eX, eY and eZ contain errors, which PCI defines in pixels.",
+        ),
         _EPOCH,
     ),
     (*_NEVER, Subject.IDENTITY),
@@ -174,7 +183,8 @@ ODM_READER = Reader(
         Treatment(
             Subject.HORIZONTAL_DATUM,
             "used",
-            "The first line: a code, a PROJ string, a name such as `WGS84 UTM 31N`, or WKT.",
+            "The first line states the system as a code, a PROJ string, WKT, or a name "
+            "such as `WGS84 UTM 31N`.",
         ),
         Treatment(
             Subject.HORIZONTAL_DATUM, "assumed", "`WGS84 UTM 31` without N or S means the northern zone."
@@ -187,7 +197,7 @@ ODM_READER = Reader(
         ),
         _NO_DATUM,
         Treatment(
-            Subject.UNIT, "used", "The unit of a reference system with heights, or a unit in a comment."
+            Subject.UNIT, "used", "A reference system with heights, or a comment, states the unit."
         ),
         Treatment(
             Subject.UNIT,
@@ -197,11 +207,15 @@ ODM_READER = Reader(
         _FEET_IN_COMMENT,
         Treatment(Subject.PIXEL_ORIGIN, "assumed", "The centre of the first pixel is (0, 0)."),
         _EXCHANGED,
-        Treatment(Subject.VALIDITY, "used", "Points whose names begin with CHK- are check points."),
+        Treatment(
+            Subject.VALIDITY,
+            "used",
+            "The name of a point begins with `CHK-`: the point is a check point.",
+        ),
         _ACCURACY,
         _EPOCH,
         _FILE_NAMES,
-        Treatment(Subject.IDENTITY, "named", "Fields after the name of the point."),
+        Treatment(Subject.IDENTITY, "named", "A line contains fields after the name of the point."),
     ),
     _NEVER,
 )
@@ -212,7 +226,7 @@ CSV_READER = Reader(
         Treatment(
             Subject.HORIZONTAL_DATUM,
             "used",
-            "A comment such as `# crs=EPSG:4230`, or a column that states WGS 84.",
+            "A comment such as `# crs=EPSG:4230` states the system, or a column states WGS 84.",
         ),
         Treatment(
             Subject.HORIZONTAL_DATUM, "assumed", "Columns of longitude and latitude are in WGS 84."
@@ -220,37 +234,40 @@ CSV_READER = Reader(
         Treatment(
             Subject.HORIZONTAL_DATUM,
             "named",
-            "A column with zones or codes, if you state the system with `--crs`. Columns of a second "
-            "position.",
+            "A column contains zones or codes, but you state the system with `--crs`. Or "
+            "columns contain a second position.",
         ),
         Treatment(
             Subject.HORIZONTAL_DATUM,
             "refused",
-            "Columns x and y without a stated system (`--crs`), a column that states another datum, or "
-            "a system that is not of the Earth.",
+            "Columns x and y have no stated system (state it with `--crs`). Or a column "
+            "states a datum other than WGS 84, or the system is not of the Earth.",
         ),
         Treatment(
             Subject.VERTICAL_DATUM,
             "used",
-            "The name of the height column, such as `h_ell` or `height_egm96`, or a comment.",
+            "The name of the height column, such as `h_ell` or `height_egm96`, or a "
+            "comment states the datum.",
         ),
         Treatment(
             Subject.VERTICAL_DATUM,
             "named",
-            "Further columns of heights, the height of the geoid, and the name of a datum in a column, "
-            "if another statement decides.",
+            "The file has further columns of heights, a column with the height of the "
+            "geoid, or the name of a datum in a column, and another statement states the "
+            "datum.",
         ),
         Treatment(
             Subject.VERTICAL_DATUM,
             "refused",
-            "No datum is stated, or you state another datum than the file. Also refused are several "
-            "columns of heights, and a column that may contain heights but has a name that Amers does "
-            "not understand.",
+            "No datum is stated, or you state another datum than the file. Or there are "
+            "several columns of heights, or a column may contain heights but Amers does "
+            "not understand its name.",
         ),
         Treatment(
             Subject.UNIT,
             "used",
-            "The name of the column, such as `height_ft`, `z [cm]` or `h (US survey feet)`.",
+            "The name of the column states the unit, such as `height_ft`, `z [cm]` or `h "
+            "(US survey feet)`.",
         ),
         Treatment(Subject.UNIT, "assumed", "Heights are in metres if the column names no unit."),
         Treatment(
@@ -259,8 +276,16 @@ CSV_READER = Reader(
             "Columns x and y name another unit than their reference system has. Heights have no unit "
             "although x and y are in feet. A column states another unit than metres.",
         ),
-        Treatment(Subject.PIXEL_ORIGIN, "used", "A comment such as `# pixel-origin=centre`."),
-        Treatment(Subject.PIXEL_ORIGIN, "named", "Columns of line and sample without a stated origin."),
+        Treatment(
+            Subject.PIXEL_ORIGIN,
+            "used",
+            "A comment such as `# pixel-origin=centre` states the pixel origin.",
+        ),
+        Treatment(
+            Subject.PIXEL_ORIGIN,
+            "named",
+            "The file has columns of line and sample, but states no pixel origin.",
+        ),
         Treatment(
             Subject.PIXEL_ORIGIN, "refused", "The comment states an origin that Amers does not know."
         ),
@@ -276,16 +301,25 @@ CSV_READER = Reader(
             "points are mixed.",
         ),
         Treatment(
-            Subject.VALIDITY, "used", "Columns active, enabled and check with 1, 0, true or false."
+            Subject.VALIDITY,
+            "used",
+            "The columns `active`, `enabled` and `check` contain 1, 0, true or false: "
+            "points can be inactive, or check points.",
         ),
-        Treatment(Subject.VALIDITY, "named", "A column such as status that contains other words."),
+        Treatment(Subject.VALIDITY, "named", "A column such as `status` contains other words."),
         Treatment(
-            Subject.ACCURACY, "used", "Columns `sigma_…_m`, also with other units in their names."
+            Subject.ACCURACY,
+            "used",
+            "Columns `sigma_…_m` contain standard deviations. Their names can also contain other units.",
         ),
-        Treatment(Subject.ACCURACY, "named", "Other accuracies: CE90, LE90, RMSE, DOP."),
-        Treatment(Subject.EPOCH, "named", "An epoch in a column or in a comment."),
+        Treatment(
+            Subject.ACCURACY,
+            "named",
+            "The file states other measures of accuracy, such as CE90, LE90, RMSE or DOP.",
+        ),
+        Treatment(Subject.EPOCH, "named", "A column or a comment states an epoch of the coordinates."),
         _FILE_NAMES,
-        Treatment(Subject.IDENTITY, "named", "All other columns."),
+        Treatment(Subject.IDENTITY, "named", "The file has columns other than those named here."),
         Treatment(Subject.IDENTITY, "refused", "Two rows give one point different positions."),
     ),
     _NEVER,
@@ -294,43 +328,62 @@ GEOJSON_READER = Reader(
     "GeoJSON of points",
     ("parse_geojson_points",),
     (
-        Treatment(Subject.HORIZONTAL_DATUM, "used", "The member `crs` of older GeoJSON."),
+        Treatment(
+            Subject.HORIZONTAL_DATUM,
+            "used",
+            "The member `crs` of older GeoJSON states the reference system.",
+        ),
         Treatment(
             Subject.HORIZONTAL_DATUM, "assumed", "Coordinates are in WGS 84, as RFC 7946 requires."
         ),
         Treatment(
             Subject.HORIZONTAL_DATUM,
             "named",
-            "`coordRefSys` of JSON-FG, because `geometry` is in WGS 84 there.",
+            "The member `coordRefSys` of JSON-FG states a system. `geometry` is in WGS 84"
+            " in such a file.",
         ),
         _OTHER_BODY,
-        Treatment(Subject.VERTICAL_DATUM, "used", "The member `heights`, which Amers writes."),
+        Treatment(
+            Subject.VERTICAL_DATUM, "used", "The member `heights`, which Amers writes, states the datum."
+        ),
         Treatment(
             Subject.VERTICAL_DATUM,
             "named",
-            "Properties that contain heights in addition to the coordinates.",
+            "Properties contain heights in addition to the coordinates.",
         ),
         Treatment(
             Subject.VERTICAL_DATUM,
             "refused",
             "The third coordinate is missing, or it is 0 and a property contains a height.",
         ),
-        Treatment(Subject.UNIT, "named", "A property that states a unit."),
-        Treatment(Subject.PIXEL_ORIGIN, "used", "The member `pixel_origin`, which Amers writes."),
+        Treatment(Subject.UNIT, "named", "A property states a unit."),
+        Treatment(
+            Subject.PIXEL_ORIGIN,
+            "used",
+            "The member `pixel_origin`, which Amers writes, states the pixel origin.",
+        ),
         Treatment(Subject.PIXEL_ORIGIN, "assumed", "The centre of the first pixel is (0, 0)."),
-        Treatment(Subject.PIXEL_ORIGIN, "refused", "`pixel_origin` states another origin."),
+        Treatment(
+            Subject.PIXEL_ORIGIN,
+            "refused",
+            "The member `pixel_origin` states an origin that Amers does not know.",
+        ),
         Treatment(
             Subject.ORDER,
             "refused",
             "A latitude is above 90 degrees, or the points are in the area of their system only if x "
             "and y are exchanged.",
         ),
-        Treatment(Subject.VALIDITY, "used", "The properties status and check."),
-        Treatment(Subject.ACCURACY, "used", "The properties `sigma_…`."),
-        Treatment(Subject.ACCURACY, "named", "All other properties."),
-        Treatment(Subject.EPOCH, "named", "The member `coordinateEpoch`, or a property."),
+        Treatment(
+            Subject.VALIDITY,
+            "used",
+            "The properties `status` and `check` state which points are inactive or check points.",
+        ),
+        Treatment(Subject.ACCURACY, "used", "The properties `sigma_…` contain standard deviations."),
+        Treatment(Subject.ACCURACY, "named", "A feature has properties other than those named here."),
+        Treatment(Subject.EPOCH, "named", "The member `coordinateEpoch` or a property states an epoch."),
         _FILE_NAMES,
-        Treatment(Subject.IDENTITY, "named", "All other properties."),
+        Treatment(Subject.IDENTITY, "named", "A feature has properties other than those named here."),
     ),
     _NEVER,
 )
@@ -338,27 +391,31 @@ OPF_READER = Reader(
     "OPF control points",
     ("parse_opf",),
     (
-        Treatment(Subject.HORIZONTAL_DATUM, "used", "The `crs` of each point."),
+        Treatment(
+            Subject.HORIZONTAL_DATUM, "used", "The `crs` of each point states the reference system."
+        ),
         _OTHER_BODY,
-        Treatment(Subject.VERTICAL_DATUM, "used", "A `crs` with heights."),
+        Treatment(Subject.VERTICAL_DATUM, "used", "The `crs` of a point is a system with heights."),
         Treatment(
             Subject.VERTICAL_DATUM,
             "assumed",
-            "With a `crs` without heights, heights are above the ellipsoid.",
+            "Heights are above the ellipsoid if the `crs` is a system without heights.",
         ),
-        Treatment(Subject.UNIT, "used", "The unit of the `crs`."),
+        Treatment(Subject.UNIT, "used", "The `crs` states the unit."),
         Treatment(Subject.PIXEL_ORIGIN, "assumed", "The corner of the first pixel is (0, 0)."),
-        Treatment(Subject.ORDER, "used", "The order of the axes of the `crs`."),
+        Treatment(Subject.ORDER, "used", "The `crs` states the order of its axes."),
         _EXCHANGED,
         Treatment(Subject.VALIDITY, "used", "`is_checkpoint` marks check points."),
-        Treatment(Subject.ACCURACY, "used", "`sigmas` and `accuracy`."),
-        Treatment(Subject.EPOCH, "named", "The `epoch` of a `crs`."),
+        Treatment(
+            Subject.ACCURACY, "used", "The members `sigmas` and `accuracy` state standard deviations."
+        ),
+        Treatment(Subject.EPOCH, "named", "The `crs` states an `epoch`."),
         Treatment(
             Subject.IDENTITY,
             "assumed",
             "If the file names no images, the ids of cameras are used as the names of images.",
         ),
-        Treatment(Subject.IDENTITY, "named", "Manual tie points."),
+        Treatment(Subject.IDENTITY, "named", "The file contains manual tie points."),
     ),
     _NEVER,
 )
@@ -379,8 +436,10 @@ GCPLIB_READER = Reader(
             "refused",
             "The map coordinates and the longitude and latitude are different positions.",
         ),
-        Treatment(Subject.EPOCH, "named", "The date of the image from which the chip was cut."),
-        Treatment(Subject.ACCURACY, "named", "The flag ABS or REL."),
+        Treatment(
+            Subject.EPOCH, "named", "The file states the date of the image from which the chip was cut."
+        ),
+        Treatment(Subject.ACCURACY, "named", "A point has the flag ABS or REL."),
     ),
     (*_NEVER, Subject.PIXEL_ORIGIN, Subject.VALIDITY, Subject.IDENTITY),
 )
@@ -389,10 +448,16 @@ COPERNICUS_READER = Reader(
     ("parse_copernicus",),
     (
         Treatment(Subject.HORIZONTAL_DATUM, "assumed", "Longitude and latitude are in WGS 84."),
-        Treatment(Subject.HORIZONTAL_DATUM, "refused", "`EPSG` is not a UTM zone of WGS 84."),
+        Treatment(
+            Subject.HORIZONTAL_DATUM,
+            "refused",
+            "`EPSG` states a system that is not a UTM zone of WGS 84.",
+        ),
         _NO_DATUM,
-        Treatment(Subject.UNIT, "used", "`@unit` of `Altimetry`."),
-        Treatment(Subject.UNIT, "refused", "`@unit` is not a known unit of length."),
+        Treatment(Subject.UNIT, "used", "The attribute `unit` of `Altimetry` states the unit."),
+        Treatment(
+            Subject.UNIT, "refused", "The attribute `unit` of `Altimetry` is not a known unit of length."
+        ),
         Treatment(
             Subject.ORDER,
             "used",
@@ -403,7 +468,7 @@ COPERNICUS_READER = Reader(
             "refused",
             "The map coordinates and the longitude and latitude are different positions.",
         ),
-        Treatment(Subject.ACCURACY, "named", "`Quality_Indicators`."),
+        Treatment(Subject.ACCURACY, "named", "A point has `Quality_Indicators`."),
     ),
     (*_NEVER, Subject.PIXEL_ORIGIN, Subject.VALIDITY, Subject.EPOCH, Subject.IDENTITY),
 )

@@ -27,17 +27,20 @@ AUX_READER = Reader(
         Treatment(
             Subject.MODEL,
             "used",
-            "The metadata domain RPC. In the order of GDAL, it comes after the tags of a GeoTIFF.",
+            "The metadata domain RPC contains a model. In the order of GDAL, this model "
+            "comes after the tags of a GeoTIFF.",
         ),
         Treatment(Subject.MODEL, "refused", "A number of the RPC is missing."),
         Treatment(
-            Subject.PLACE, "used", "GeoTransform. It has precedence over the geotransform of the image."
+            Subject.PLACE,
+            "used",
+            "GeoTransform states the map grid. It has precedence over the geotransform of the image.",
         ),
         Treatment(Subject.PLACE, "refused", "GeoTransform does not consist of six numbers."),
         Treatment(
             Subject.HORIZONTAL_DATUM,
             "used",
-            "SRS. It has precedence over the reference system of the image.",
+            "SRS states the reference system. It has precedence over the system of the image.",
         ),
         Treatment(Subject.HORIZONTAL_DATUM, "refused", "SRS is not WKT."),
     ),
@@ -60,13 +63,17 @@ WORLD_FILE_READER = Reader(
         Treatment(
             Subject.PLACE,
             "used",
-            "The world file, if neither the image nor its `.aux.xml` file has a geotransform.",
+            "A world file exists, and neither the image nor its `.aux.xml` file has a geotransform.",
         ),
         Treatment(
-            Subject.PLACE, "named", "The world file, if its geotransform differs from that of the image."
+            Subject.PLACE,
+            "named",
+            "A world file exists, and its geotransform differs from the geotransform of the image.",
         ),
         Treatment(Subject.PLACE, "refused", "The world file does not consist of six numbers."),
-        Treatment(Subject.HORIZONTAL_DATUM, "used", "The `.prj` file, if nothing else states a system."),
+        Treatment(
+            Subject.HORIZONTAL_DATUM, "used", "A `.prj` file exists, and no other file states a system."
+        ),
         Treatment(
             Subject.HORIZONTAL_DATUM,
             "refused",

@@ -10,43 +10,48 @@ READER = Reader(
         Treatment(
             Subject.VALIDITY,
             "used",
-            "The first that exists of: a mask inside the file, a mask file next to it (`NAME.msk`), an "
-            "alpha band with any band number, a nodata value (of the file, of `NAME.aux.xml`, or of a "
-            "DIMAP document). A mean of bands has no data where none of the bands has data.",
+            "The image states which pixels have no data. Amers uses the first that exists"
+            " of: a mask inside the file, a mask file next to it (`NAME.msk`), an alpha "
+            "band, a nodata value (of the file, of `NAME.aux.xml`, or of a DIMAP "
+            "document). A mean of bands has no data where none of its bands has data.",
         ),
         Treatment(
             Subject.VALIDITY,
             "named",
-            "All later ones of this list. An alpha band with a range of grey values, which is used as a "
-            "band of the image. A `NAME.msk` that is not a mask of all bands.",
+            "The image has a second statement about valid pixels, an alpha band with a "
+            "range of grey values (Amers uses it as a band of the image), or a `NAME.msk`"
+            " that is not a mask of all bands.",
         ),
         Treatment(Subject.VALIDITY, "refused", "`NAME.msk` has another size than the image."),
         Treatment(
             Subject.BANDS,
             "used",
-            "The bands of `--bands`. Without this option: the mean of red, green and blue, if they "
-            "match within 0.3 px; a band of brightness (Y, lightness); the grey value of the colours of "
-            "a colour table.",
+            "`--bands` states the bands. Without this option, Amers uses the mean of red,"
+            " green and blue if they match within 0.3 px, a band of brightness (Y, "
+            "lightness), or the grey values of a colour table.",
         ),
         Treatment(
             Subject.BANDS,
             "assumed",
-            "If no band has a colour, the mean of the first three bands, or the first of two bands. If "
-            "the bands do not match within 0.3 px or cannot be compared, the middle band alone.",
+            "No band has a stated colour: Amers uses the mean of the first three bands, "
+            "or the first band if there are two. If the bands do not match within 0.3 px "
+            "or cannot be compared, Amers uses the middle band alone.",
         ),
         Treatment(
             Subject.BANDS,
             "refused",
-            "Bands that the file does not have, inks, hue and saturation, a colour table together with "
-            "other bands, and complex numbers.",
+            "`--bands` states a band that the file does not have. Or the bands are inks, "
+            "hue or saturation, complex numbers, or a colour table together with other "
+            "bands.",
         ),
         Treatment(
             Subject.UNIT,
             "named",
-            "Unit, scale and offset, because only the contrast of a scene matters.",
+            "The file states a unit, a scale or an offset of the pixel values. A "
+            "registration depends only on contrast.",
         ),
         Treatment(
-            Subject.IDENTITY, "named", "Further images in the file, because the first image is read."
+            Subject.IDENTITY, "named", "The file contains further images. Amers reads the first image."
         ),
     ),
     (
@@ -68,9 +73,10 @@ MASK_READER = Reader(
         Treatment(
             Subject.VALIDITY,
             "used",
-            "Pixels that are not 0 are excluded. Nodata pixels of the mask exclude nothing.",
+            "Pixels of the mask that are not 0 exclude pixels of the image. Nodata pixels"
+            " of the mask exclude nothing.",
         ),
-        Treatment(Subject.PLACE, "used", "The map grid of the mask, in any reference system."),
+        Treatment(Subject.PLACE, "used", "The mask has a map grid, in any reference system."),
         Treatment(
             Subject.PLACE,
             "assumed",

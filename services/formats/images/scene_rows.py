@@ -10,12 +10,14 @@ READER = Reader(
         Treatment(
             Subject.MODEL,
             "used",
-            "The first model in the order of GDAL: files of vendors, tags of the image, other files.",
+            "The scene has one or more models. Amers uses the first one in the order of "
+            "GDAL: files of vendors, tags of the image, other files.",
         ),
         Treatment(
             Subject.MODEL,
             "named",
-            "Every other model that differs from the used model by 0.01 px or more, or cannot be read.",
+            "The scene has a further model that differs from the used model by 0.01 px or"
+            " more, or that cannot be read.",
         ),
         Treatment(
             Subject.MODEL,
@@ -23,34 +25,44 @@ READER = Reader(
             "There is no model, or there are only ground control points, to which no model is fitted.",
         ),
         Treatment(
-            Subject.PLACE, "used", "ICHIPB of a NITF, or the geotransform of a cropped or reduced image."
+            Subject.PLACE,
+            "used",
+            "ICHIPB of a NITF, or the geotransform of a cropped or reduced image, states "
+            "the position of the image in the full image.",
         ),
         Treatment(
             Subject.PLACE,
             "assumed",
-            "If an image is a tile by its name, a model with the name of the tile is the model of the "
-            "tile.",
+            "The name of the image shows that it is a tile, and a model has the same "
+            "name: the model belongs to the tile.",
         ),
-        Treatment(Subject.PLACE, "named", "The map grid of an image that has a sensor model."),
+        Treatment(Subject.PLACE, "named", "An image with a sensor model also has a map grid."),
         Treatment(
             Subject.PLACE,
             "refused",
-            "A cropped image whose RPC may belong to the crop or to the full image. State "
-            "`--crop-origin`.",
+            "The image is cropped, and the RPC may belong to the crop or to the full "
+            "image. State `--crop-origin`.",
         ),
-        Treatment(Subject.ACCURACY, "used", "ERR_BIAS and ERR_RAND of tags and of RPC00B."),
         Treatment(
-            Subject.ACCURACY, "named", "ERR_BIAS and ERR_RAND, if `--sigma-m` states another accuracy."
+            Subject.ACCURACY, "used", "ERR_BIAS and ERR_RAND in tags or in RPC00B state the accuracy."
+        ),
+        Treatment(
+            Subject.ACCURACY,
+            "named",
+            "The file has ERR_BIAS and ERR_RAND, but `--sigma-m` states another accuracy.",
         ),
         Treatment(
             Subject.ACCURACY,
             "assumed",
-            "The accuracy of the sensor, if Amers knows the sensor; otherwise 50 m.",
+            "The file states no accuracy: Amers uses the accuracy of the sensor if it "
+            "knows the sensor, otherwise 50 m.",
         ),
         Treatment(
-            Subject.IDENTITY, "used", "MISSION and IMAGING_DATE of the tags, and IDATIM of a NITF."
+            Subject.IDENTITY,
+            "used",
+            "MISSION and IMAGING_DATE in tags, or IDATIM of a NITF, state the sensor and the time.",
         ),
-        Treatment(Subject.HORIZONTAL_DATUM, "used", "The reference system of an ortho-image."),
+        Treatment(Subject.HORIZONTAL_DATUM, "used", "An ortho-image states its reference system."),
     ),
     never=(
         Subject.PIXEL_ORIGIN,

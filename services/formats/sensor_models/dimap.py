@@ -29,7 +29,9 @@ READER = Reader(
     ("parse_dimap_rpc", "parse_dimap_acquisition", "parse_dimap_pixel_codes"),
     (
         Treatment(
-            Subject.MODEL, "used", "Inverse_Model in version 2, GroundtoImage_Values in version 3."
+            Subject.MODEL,
+            "used",
+            "Inverse_Model in version 2, or GroundtoImage_Values in version 3, states the RPC.",
         ),
         Treatment(Subject.MODEL, "refused", "The document has another version, or a number is missing."),
         Treatment(
@@ -40,28 +42,36 @@ READER = Reader(
         Treatment(
             Subject.PLACE,
             "used",
-            "The position of the tile that `DIM_….XML` lists. A part such as `_R2C1` of the file name "
-            "identifies the tile.",
+            "`DIM_….XML` lists the position of each tile. A part such as `_R2C1` of the "
+            "file name identifies the tile.",
         ),
         Treatment(
             Subject.PLACE,
             "refused",
-            "A tile without `DIM_….XML`, or with another size than this document states.",
+            "The image is a tile and has no `DIM_….XML`, or the tile has another size "
+            "than this document states.",
         ),
         Treatment(
             Subject.PLACE,
             "assumed",
-            "If the image has another size than the domain of the model, both begin at the same first "
-            "pixel.",
+            "The image has another size than the domain of the model: Amers assumes that "
+            "both begin at the same first pixel.",
         ),
-        Treatment(Subject.VALIDITY, "used", "The special values NODATA and SATURATED of `DIM_….XML`."),
+        Treatment(
+            Subject.VALIDITY, "used", "`DIM_….XML` states the special values NODATA and SATURATED."
+        ),
         Treatment(
             Subject.ACCURACY,
             "named",
-            "The errors of the fit of the polynomials, which are not the accuracy of the scene.",
+            "The file states errors of the fit of the polynomials. These are not the "
+            "accuracy of the scene.",
         ),
-        Treatment(Subject.ACCURACY, "assumed", "The accuracy of the sensor."),
-        Treatment(Subject.IDENTITY, "used", "Mission, time and sun angles of `DIM_….XML`."),
+        Treatment(
+            Subject.ACCURACY,
+            "assumed",
+            "The file states no accuracy of the scene: Amers uses the accuracy of the sensor.",
+        ),
+        Treatment(Subject.IDENTITY, "used", "`DIM_….XML` states mission, time and sun angles."),
     ),
     never=(
         Subject.HORIZONTAL_DATUM,

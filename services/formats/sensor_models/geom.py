@@ -27,24 +27,33 @@ READER = Reader(
     "OSSIM and OTB `.geom`",
     ("parse_geom", "parse_geom_acquisition"),
     (
-        Treatment(Subject.MODEL, "used", "The RPC, with its current adjustment applied."),
         Treatment(
-            Subject.MODEL, "refused", "The file has no RPC, or an adjustment that an RPC cannot express."
+            Subject.MODEL,
+            "used",
+            "The file contains an RPC. Amers applies the current adjustment of the file to it.",
+        ),
+        Treatment(
+            Subject.MODEL,
+            "refused",
+            "The file has no RPC, or it has an adjustment that an RPC cannot express.",
         ),
         Treatment(
             Subject.PIXEL_ORIGIN,
             "used",
-            "Amers corrects the half pixel that the OSSIM loaders of two sensors lose.",
+            "The file comes from one of two OSSIM loaders that lose half a pixel. Amers "
+            "corrects this half pixel.",
         ),
         Treatment(Subject.ORDER, "refused", "polynomial_format is neither A nor B."),
         Treatment(
             Subject.PLACE,
             "used",
-            "The geotransform of an image that OTB cropped. The range of the RPC decides whether the "
-            "RPC belongs to the full image.",
+            "An image that OTB cropped has a geotransform. The range of the RPC decides "
+            "whether the RPC belongs to the full image.",
         ),
-        Treatment(Subject.ACCURACY, "used", "bias_error and rand_error, if they are positive."),
-        Treatment(Subject.IDENTITY, "used", "sensor, image_date and the sun angles."),
+        Treatment(Subject.ACCURACY, "used", "bias_error and rand_error are positive numbers."),
+        Treatment(
+            Subject.IDENTITY, "used", "sensor, image_date and the sun angles describe the acquisition."
+        ),
     ),
     never=(
         Subject.HORIZONTAL_DATUM,

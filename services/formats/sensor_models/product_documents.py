@@ -24,20 +24,20 @@ READER = Reader(
         Treatment(
             Subject.PLACE,
             "used",
-            "Regular_Tiling, or the offsets of a `.TIL` file. They state the position of each tile, and "
-            "all tiles are read as one image.",
+            "Regular_Tiling, or the offsets of a `.TIL` file, state the position of each "
+            "tile. Amers reads all tiles as one image.",
         ),
         Treatment(
             Subject.PLACE, "refused", "Tiles are missing, overlap, or have another size than stated."
         ),
         Treatment(Subject.UNIT, "refused", "tileUnits is not Pixels."),
-        Treatment(Subject.MODEL, "used", "The RPC of the whole image."),
+        Treatment(Subject.MODEL, "used", "The document names the RPC of the whole image."),
         Treatment(
             Subject.BANDS,
             "named",
-            "A second image of the product, such as NED of Pléiades Neo.",
+            "The product contains a second image, such as NED of Pléiades Neo.",
         ),
-        Treatment(Subject.IDENTITY, "used", "The sensor of the product."),
+        Treatment(Subject.IDENTITY, "used", "The document states the sensor of the product."),
     ),
     never=(
         Subject.PIXEL_ORIGIN,

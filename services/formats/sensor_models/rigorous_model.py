@@ -22,25 +22,27 @@ READER = Reader(
         Treatment(
             Subject.MODEL,
             "used",
-            "If there is no RPC, an RPC is fitted to the rigorous model. With `--rigorous`, the "
-            "rigorous model itself is used.",
+            "The product has no RPC: Amers fits an RPC to the rigorous model. With "
+            "`--rigorous`, Amers uses the rigorous model itself.",
         ),
         Treatment(
             Subject.MODEL,
             "named",
-            "Orbit and attitude, if the RPC is used. `amers scene register-many --rigorous` adjusts "
-            "them.",
+            "The product also has an RPC, and Amers uses the RPC. `amers scene "
+            "register-many --rigorous` adjusts orbit and attitude instead.",
         ),
         Treatment(Subject.MODEL, "refused", "A value is missing, impossible or not supported."),
         Treatment(
             Subject.IDENTITY,
             "used",
-            "The name of the product, because all images have the name IMAGERY.",
+            "The document states the name of the product, which identifies the image: all"
+            " images have the file name IMAGERY.",
         ),
         Treatment(
             Subject.ACCURACY,
             "assumed",
-            "The accuracy of the sensor, if Amers knows the sensor; otherwise 50 m.",
+            "The file states no accuracy: Amers uses the accuracy of the sensor if it "
+            "knows the sensor, otherwise 50 m.",
         ),
     ),
     never=(

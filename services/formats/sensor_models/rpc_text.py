@@ -21,16 +21,19 @@ RPC_TEXT_READER = Reader(
     "RPC as text (`_RPC.TXT`, `.rpc`)",
     ("parse_rpc_text",),
     (
-        Treatment(Subject.MODEL, "used", "Lines `KEY: number` or `KEY=number`, in any order."),
+        Treatment(
+            Subject.MODEL, "used", "Lines `KEY: number` or `KEY=number`, in any order, state the RPC."
+        ),
         Treatment(
             Subject.MODEL, "refused", "A key is missing or occurs twice, or its value is not a number."
         ),
         Treatment(Subject.UNIT, "refused", "The unit after a number is not pixels, degrees or metres."),
-        Treatment(Subject.ACCURACY, "used", "ERR_BIAS and ERR_RAND in metres, if they are positive."),
+        Treatment(Subject.ACCURACY, "used", "ERR_BIAS and ERR_RAND are positive numbers, in metres."),
         Treatment(
             Subject.ACCURACY,
             "assumed",
-            "The accuracy of the sensor, if Amers knows the sensor; otherwise 50 m.",
+            "The file states no accuracy: Amers uses the accuracy of the sensor if it "
+            "knows the sensor, otherwise 50 m.",
         ),
         Treatment(
             Subject.IDENTITY,
@@ -53,20 +56,28 @@ RPB_READER = Reader(
     "DigitalGlobe `.RPB`",
     ("parse_rpb",),
     (
-        Treatment(Subject.MODEL, "used", "The fields of the group IMAGE."),
+        Treatment(Subject.MODEL, "used", "The fields of the group IMAGE state the RPC."),
         Treatment(
             Subject.PLACE,
             "used",
             "The `.TIL` file of the product states the position of a tile in its image.",
         ),
         Treatment(
-            Subject.PLACE, "assumed", "Without a `.TIL` file, the RPB belongs to the tile itself."
+            Subject.PLACE,
+            "assumed",
+            "The product has no `.TIL` file: the RPB belongs to the tile itself.",
         ),
         Treatment(Subject.ORDER, "refused", "SpecId is not RPC00B."),
-        Treatment(Subject.ACCURACY, "used", "errBias and errRand in metres, if they are positive."),
-        Treatment(Subject.IDENTITY, "used", "satId, and the time of the first line in the `.IMD` file."),
+        Treatment(Subject.ACCURACY, "used", "errBias and errRand are positive numbers, in metres."),
         Treatment(
-            Subject.BANDS, "named", "bandId, because the model is used for all bands of the image."
+            Subject.IDENTITY,
+            "used",
+            "satId states the sensor, and the `.IMD` file the time of the first image line.",
+        ),
+        Treatment(
+            Subject.BANDS,
+            "named",
+            "bandId states a band. Amers uses the model for all bands of the image.",
         ),
     ),
     never=(

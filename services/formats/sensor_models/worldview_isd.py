@@ -40,7 +40,7 @@ READER = Reader(
         Treatment(
             Subject.MODEL,
             "used",
-            "The block RPB. Without this block, an RPC is fitted to orbit and attitude.",
+            "The block RPB states the RPC. Without this block, Amers fits an RPC to orbit and attitude.",
         ),
         Treatment(Subject.MODEL, "refused", "A value is missing or impossible."),
         Treatment(
@@ -51,15 +51,19 @@ READER = Reader(
         Treatment(
             Subject.PLACE,
             "assumed",
-            "If the image has another size than NUMROWS x NUMCOLUMNS, both begin at the same first "
-            "pixel.",
+            "The image has another size than NUMROWS x NUMCOLUMNS: Amers assumes that "
+            "both begin at the same first pixel.",
         ),
         Treatment(Subject.ORDER, "refused", "SPECID is not RPC00B."),
-        Treatment(Subject.ACCURACY, "used", "ERRBIAS and ERRRAND in metres, if they are positive."),
+        Treatment(Subject.ACCURACY, "used", "ERRBIAS and ERRRAND are positive numbers, in metres."),
         Treatment(
-            Subject.ACCURACY, "assumed", "The accuracy of the sensor, if ERRBIAS and ERRRAND are zero."
+            Subject.ACCURACY,
+            "assumed",
+            "ERRBIAS and ERRRAND are zero: Amers uses the accuracy of the sensor.",
         ),
-        Treatment(Subject.IDENTITY, "used", "SATID, FIRSTLINETIME and the sun angles."),
+        Treatment(
+            Subject.IDENTITY, "used", "SATID, FIRSTLINETIME and the sun angles describe the acquisition."
+        ),
     ),
     never=(
         Subject.PIXEL_ORIGIN,

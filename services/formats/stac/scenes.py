@@ -28,9 +28,9 @@ READER = Reader(
         Treatment(
             Subject.VALIDITY,
             "used",
-            "Masks in GeoJSON: the ground that they cover counts as hidden in the image.",
+            "The item has masks in GeoJSON. The ground that they cover counts as hidden in the image.",
         ),
-        Treatment(Subject.VALIDITY, "named", "Masks in other formats."),
+        Treatment(Subject.VALIDITY, "named", "The item has masks in other formats."),
         Treatment(
             Subject.BANDS, "refused", "The item has several images, and none of them has the role data."
         ),
@@ -40,12 +40,14 @@ READER = Reader(
         Treatment(
             Subject.HORIZONTAL_DATUM,
             "named",
-            "`proj:code` or `proj:epsg`, if the image states another system. The system of the image is "
-            "used.",
+            "`proj:code` or `proj:epsg` states another system than the image. Amers uses "
+            "the system of the image.",
         ),
         Treatment(Subject.ORDER, "refused", "A latitude of the footprint is above 90 degrees."),
         Treatment(
-            Subject.ACCURACY, "named", "`accuracy:…`, because its meaning differs between producers."
+            Subject.ACCURACY,
+            "named",
+            "The item has a property `accuracy:…`. Its meaning differs between producers.",
         ),
         Treatment(Subject.UNIT, "refused", "An angle or a percentage is out of its range."),
     ),

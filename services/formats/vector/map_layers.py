@@ -20,29 +20,37 @@ READER = Reader(
     "Vectors: GeoPackage, GeoJSON, shapefile, FlatGeobuf",
     ("read_layer", "read_map_layer", "read_pixel_layer"),
     (
-        Treatment(Subject.HORIZONTAL_DATUM, "used", "The reference system of vectors on a map."),
+        Treatment(Subject.HORIZONTAL_DATUM, "used", "Vectors on a map have a reference system."),
         Treatment(
-            Subject.HORIZONTAL_DATUM, "named", "The reference system of vectors in pixel coordinates."
+            Subject.HORIZONTAL_DATUM, "named", "Vectors in pixel coordinates have a reference system."
         ),
         Treatment(Subject.HORIZONTAL_DATUM, "refused", "The reference system is not of the Earth."),
-        Treatment(Subject.VERTICAL_DATUM, "used", "A reference system with heights, compound or not."),
+        Treatment(
+            Subject.VERTICAL_DATUM,
+            "used",
+            "The reference system has heights, as a compound system or with three axes.",
+        ),
         Treatment(
             Subject.VERTICAL_DATUM,
             "assumed",
-            "In a system without heights, heights have the vertical datum of the terrain.",
+            "The system has no heights: the heights of vertices have the vertical datum of the terrain.",
         ),
         Treatment(Subject.VERTICAL_DATUM, "refused", "The grid of the vertical datum is not installed."),
         Treatment(
-            Subject.UNIT, "used", "The height unit of a reference system with heights, such as feet."
+            Subject.UNIT,
+            "used",
+            "A reference system with heights states the unit of heights, such as feet.",
         ),
-        Treatment(Subject.UNIT, "assumed", "In a system without heights, heights are in metres."),
+        Treatment(
+            Subject.UNIT, "assumed", "The system has no heights: the heights of vertices are in metres."
+        ),
         Treatment(
             Subject.ORDER,
             "refused",
             "The vertices are in the area of their reference system only if x and y are exchanged.",
         ),
-        Treatment(Subject.EPOCH, "named", "The coordinate epoch of a GeoPackage."),
-        Treatment(Subject.IDENTITY, "named", "Other layers of the file."),
+        Treatment(Subject.EPOCH, "named", "A GeoPackage states a coordinate epoch."),
+        Treatment(Subject.IDENTITY, "named", "The file has other layers than the one that is read."),
     ),
     (
         Subject.MODEL,
