@@ -13,7 +13,8 @@ export interface RowActions {
   remove(mark: Mark): void;
 }
 
-const HEADS = ["Name", "Line", "Sample", "Longitude", "Latitude", "Height, m", "Residual, px", "Residual, m", "Without it, px", "State", "Check", "Change"];
+const FIGURES = ["Line", "Sample", "Longitude", "Latitude", "Height, m", "Residual, px", "Residual, m", "Without it, px"];
+const HEADS = ["Name", ...FIGURES, "State", "Check", "Change"];
 
 /** A table that is drawn again after each change; the control that had the focus has it again. */
 export class MarksTable {
@@ -58,9 +59,9 @@ export class MarksTable {
       "tr",
       { class: found?.status === "rejected" && "wrong" },
       h("th", { scope: "row" }, input),
-      ...cells.map((text) => h("td", {}, text)),
-      h("td", { class: "note" }, found ? badge(found.status) : "–", found?.note ? h("span", { class: "quiet" }, ` ${found.note}`) : null),
-      h("td", {}, check),
+      ...cells.map((text, at) => h("td", { "data-head": FIGURES[at] }, text)),
+      h("td", { class: "note", "data-head": "State" }, found ? badge(found.status) : "–", found?.note ? h("span", { class: "quiet" }, ` ${found.note}`) : null),
+      h("td", { "data-head": "Check" }, check),
       h("td", { class: "acts" }, button("Show", (one) => this.actions.show(one)), button("Change", (one) => this.actions.change(one)), button("Remove", (one) => this.actions.remove(one))),
     );
   }
