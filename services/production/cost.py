@@ -19,10 +19,14 @@ _CHIP_S, _CHIPS = 0.007, 2
 _SURFACE_S = 0.055
 """Of the surface at a point by one pair of images. All seconds are of one core, from `python -m
 benchmarks.production_cost --sides 5000 10000 40000`, that of surfaces with `--surfaces`."""
-_ADJUSTMENT_S, _ADJUSTMENTS = 0.08, 3
-"""Of an image in one adjustment (`python -m benchmarks.block_adjustment`: 2,000 images, 159 s)."""
+_ADJUSTMENT_S, _ADJUSTMENTS = 0.13, 3
+"""Of an image in one adjustment: 2,536 s for 20,000 images, 83 s for 2,000 (`python -m
+benchmarks.block_parts`)."""
 _MEMORY_MIB = 600
 """Of a process, whatever the size of the images: the same benchmark."""
+_BLOCK_MIB, _BLOCK_IMAGE_MIB, _BLOCK_OBSERVATION_MIB = 300, 0.12, 54e-6
+"""Of the process that assembles the adjustment: Python, an image, an observation (`python -m
+benchmarks.block_parts`, 2,000 images with 300 points each and 20,000 with 40)."""
 _CHIP_BYTES = 2 * 101 * 101
 _VALUE_BYTES = 2
 """Of a pixel, unpacked."""
@@ -36,6 +40,7 @@ class ProductionCost:
         points: number of them.
         core_s: seconds of a core, by stage.
         memory_mib: of a process.
+        block_mib: of the process that assembles the adjustment of the block.
         read_bytes: pixels that are read, unpacked: compressed files have fewer.
         written_bytes: chips of the block; the work folder has as much again.
     """
@@ -43,6 +48,7 @@ class ProductionCost:
     points: int
     core_s: Mapping[str, float]
     memory_mib: int
+    block_mib: int
     read_bytes: float
     written_bytes: float
 
@@ -51,9 +57,12 @@ class ProductionCost:
         """The cost as a sentence."""
         hours = {stage: seconds / 3600.0 for stage, seconds in self.core_s.items()}
         stages = ", ".join(f"{stage} {value:.2g}" for stage, value in hours.items())
+        memory = f"{self.memory_mib} MiB a process"
+        if self.block_mib > self.memory_mib:
+            memory += f", {self.block_mib:,} MiB in the one that assembles the adjustment"
         return (
             f"Cost of {self.points:,} points from these images: {sum(hours.values()):.2g} core-hours "
-            f"({stages}), {self.memory_mib} MiB a process, {self.read_bytes / 1e9:.2g} GB of unpacked "
+            f"({stages}), {memory}, {self.read_bytes / 1e9:.2g} GB of unpacked "
             f"pixels read, {self.written_bytes / 1e9:.2g} GB of chips written"
         )
 
@@ -83,6 +92,7 @@ def production_cost(
     features = FeatureOptions().for_chips(max(one.gsd_m for one in images), fine_gsd_m)
     searched = [searched_pixels(one, min(pixels), points * views / count, features) for one in pixels]
     partners = min(PARTNERS, count - 1)
+    observations = points * views * _CANDIDATES
     found_mpx = sum(found for found, _ in searched) / 1e6
     core_s = {
         "features": found_mpx * _FEATURE_S,
@@ -96,6 +106,10 @@ def production_cost(
         round(points),
         core_s,
         _MEMORY_MIB,
+        max(
+            _MEMORY_MIB,
+            round(_BLOCK_MIB + count * _BLOCK_IMAGE_MIB + observations * _BLOCK_OBSERVATION_MIB),
+        ),
         sum(read for _, read in searched) * _VALUE_BYTES,
         points * views * _CHIPS * _CHIP_BYTES,
     )

@@ -29,3 +29,11 @@ def test_a_point_for_two_square_kilometres_costs_what_was_measured() -> None:
     # 1.6 billion pixels an image, of which at most a third is read.
     assert whole.read_bytes < 12 * 1.6e9 * 2 / 3
     assert "core-hours" in whole.words
+
+
+@pytest.mark.parametrize(("count", "expected_mib"), [(2_000, 569), (20_000, 2_700)])
+def test_a_large_block_needs_the_memory_that_was_measured(count: int, expected_mib: float) -> None:
+    """Those blocks were measured without the points of a production, which are few here."""
+    stated = cost(60.0, count, spacing_m=20_000.0)
+    assert stated.block_mib == pytest.approx(expected_mib, rel=0.15)
+    assert ("assembles the adjustment" in stated.words) == (count > 5_000)
