@@ -45,7 +45,7 @@ class Outcome:
         ground_normalised: as `normalised`, on the Earth.
         wrong_share: of the image that is off by more than `WRONG` times the CE90 predicted there.
         judged_share: of the image: neither moved ground, nor shown twice. All else is left aside.
-        held_percent: share of the image that points hold: all figures of errors are of that part.
+        held_percent: share of the image that points support: all figures of errors are of that part.
         line_gap_px: median distance along lines from an active point to the next.
         spacing_px: of the points that were searched, if they were evenly spread.
         followable: whether a distortion is smooth enough for that spacing: its shortest period is at

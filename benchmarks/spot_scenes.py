@@ -82,7 +82,7 @@ class Row:
     Attributes:
         case: what was registered, and how.
         verdict: of the report; "refused" without one.
-        held_percent: share of the image with pixels that points hold.
+        held_percent: share of the image with pixels that points support.
         before_m: CE90 of the delivered model.
         ce90_m: true CE90, over the area for which accuracy is stated.
         stated_m: CE90 stated over that area (median), relative to the control points.
@@ -234,7 +234,7 @@ def _judged(image: Path, truth: Truth, case: Case, folder: Path) -> Row:
 
 
 def _vectors(image: Path, truth: Truth, registered: Path, dem: list[object]) -> float:
-    """True over stated CE90 of points drawn on the scene, of those on the terrain that points hold."""
+    """True over stated CE90 of points drawn on the scene, on the terrain that points support."""
     places = [{"type": "Point", "coordinates": place[::-1]} for place in truth.line_sample.tolist()]
     features = [{"type": "Feature", "properties": {}, "geometry": place} for place in places]
     drawn, output = registered / "drawn.geojson", registered / "map.geojson"

@@ -246,6 +246,6 @@ def _check_control(control: ControlGround, active: BoolArray) -> None:
         names = ", ".join(name for name, agrees in zip(control.names, active, strict=True) if not agrees)
         raise NoConsensus(
             f"{len(control) - active.sum()} of {len(control)} control points disagree with the block "
-            f"and with each other: {names}. State larger sigmas or a larger frame, or "
+            f"and with each other: {names}. State larger sigmas or a larger common error, or "
             "remove wrong points"
         )

@@ -99,7 +99,7 @@ class AdjustableImage(Protocol):
 
     @property
     def deformable(self) -> bool:
-        """Whether only tie points hold the linear shape of the ground: parameters follow any."""
+        """Whether only tie points support the linear shape of the ground: parameters follow any."""
         ...
 
     @property

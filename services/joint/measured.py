@@ -59,7 +59,7 @@ class MeasuredScene:
         if alone and alone.components and self.motion:
             usable |= alone.active
             if any(one.kind == "break" for one in alone.components):
-                # Breaks cut chips, and leave parts that too few points hold.
+                # Breaks cut chips, and leave parts that too few points support.
                 usable = alone.active
         if alone and alone.moved:
             usable &= ~alone.moved.measures

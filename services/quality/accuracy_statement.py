@@ -67,14 +67,14 @@ def scene_accuracy(
     error of the frame in any case: its LE90 is stated on the Earth.
 
     Args:
-        relative_m: CE90 at the worst place that points hold, relative to the control points.
+        relative_m: CE90 at the worst place that points support, relative to the control points.
         on_the_earth_m: the same with the frame of the control points; NaN when unknown.
         frame: of the control points.
-        held_percent: share of the image that points hold.
+        held_percent: share of the image that points support.
     """
     le90_m = frame_le90_m(frame)
-    height = f"LE90 of the control points' frame {_metres(le90_m)}"
-    place = f"(worst place of the {_percent(held_percent)} of the image that points hold)"
+    height = f"LE90 of the control points' common error {_metres(le90_m)}"
+    place = f"(worst place of the {_percent(held_percent)} of the image that points support)"
     if held_percent == 100.0:
         place = "(worst place of the image)"
     return AccuracyStatement(
@@ -123,7 +123,7 @@ def vertices_accuracy(
 
     Args:
         relative_m: CE90 (n,) of the vertices relative to the control points; NaN when unknown, such as
-            beyond the area that points hold.
+            beyond the area that points support.
         on_the_earth_m: the same with the frame of the control points.
         frame: of the control points; None for a scene that is not registered.
     """
@@ -180,7 +180,7 @@ def _of_vertices(ce90_m: Array) -> str:
         return words
     return (
         f"{words}; unknown for {unknown} of {len(ce90_m)} vertices, beyond the area of the image that "
-        "control points hold, or where a line of sight grazes the ground"
+        "control points support, or where a line of sight grazes the ground"
     )
 
 

@@ -61,7 +61,7 @@ _DESCRIPTIONS = {
         "Active points", "", 0, "Number of points that the final adjustment uses."
     ),
     "coverage_percent": _Description(
-        "Area that points hold",
+        "Area that points support",
         "%",
         0,
         "Share of the image for which the accuracy is stated: an active point lies within reach (15 % "
@@ -98,8 +98,8 @@ _DESCRIPTIONS = {
         "CE90 on the Earth, worst place",
         "m",
         2,
-        "The covariance of the correction and that of the control points' frame, propagated to the "
-        "ground at its true height. Radius that contains 90 % of the errors by the normal law, largest "
+        "The covariance of the correction and that of the control points' common error, propagated to "
+        "the ground at its true height. Radius that contains 90 % of the errors by the normal law, largest "
         "of the grid. The option max_ce90_on_earth_m sets the limit.",
     ),
     "unit_weight": _Description(

@@ -68,4 +68,4 @@ def why_unknown(frame: Frame) -> str:
         return ""
     part = "" if unknown.all() else "height " if unknown[2] else "horizontal "
     how = f"; give {frame.how_to_state}" if frame.how_to_state else ""
-    return f"the {part}accuracy of the control points' frame is not stated{how}"
+    return f"the {part}sigma of the control points' common error is not stated{how}"

@@ -1,4 +1,4 @@
-"""The area of an image that its points hold, for which accuracy is known and stated.
+"""The area of an image that its points support, for which accuracy is known and stated.
 
 A correction is checked where points agree with it. Elsewhere it is an extrapolation, and what a scanner
 did there (lines lost, an attitude that jumped) nobody saw. A place is held by an agreeing point within
@@ -37,7 +37,7 @@ _CELLS = 50
 
 @dataclass(frozen=True)
 class HeldArea:
-    """The part of an image that points hold.
+    """The part of an image that points support.
 
     Attributes:
         cells: (c, c) whether each cell of the image is held, rows from the first line down.
@@ -143,7 +143,7 @@ class TriedPoints:
 def held_area(
     points: TriedPoints, shape: tuple[int, int], chip_side_px: float, parts: Array | None = None
 ) -> HeldArea:
-    """The part of an image that points hold.
+    """The part of an image that points support.
 
     Args:
         points: that were looked for.

@@ -24,7 +24,7 @@ class PredictedAccuracy:
         std_line_px, std_sample_px: (g, g) on a regular grid from corner to corner, relative to the
             control points.
         ce90_px: (g, g) relative to the control points.
-        worst_px: the largest of all places that points hold; NaN where they hold none.
+        worst_px: the largest of all places that points support; NaN where they hold none.
         overall_px: CE90 of all these places alike, the radius that holds 90 % of their errors: what CE90
             of check points all over them estimates.
         worst_m, overall_m: the same on the ground, relative to the control points.

@@ -45,7 +45,7 @@ class QualificationOptions:
     Attributes:
         good_active_points: smallest number of active points (SRP: one measure is never enough, at least
             20).
-        good_coverage_percent: smallest share of the image that points hold, see `HeldArea`.
+        good_coverage_percent: smallest share of the image that points support, see `HeldArea`.
         good_active_of_matched: smallest ratio of active to matched points.
         good_residual_std_px, usable_residual_std_px: largest standard deviation of the active residuals,
             of the worse coordinate, without the part that chance and the accuracy of the points explain:
@@ -132,7 +132,7 @@ class GroundResiduals:
 
 @dataclass(frozen=True)
 class Coverage:
-    """The part of the image that active points hold, see `HeldArea`: accuracy is stated for it.
+    """The part of the image that active points support, see `HeldArea`: accuracy is stated for it.
 
     Attributes:
         cells: (c, c) active points in equal cells of the image, rows from the first line down.
@@ -311,7 +311,7 @@ def _residuals_on_ground(residual_m: Array) -> GroundResiduals:
 
 
 def image_coverage(model: SensorModel, active: Measures, held: HeldArea, cells: int) -> Coverage:
-    """The area that points hold, and numbers of active points in `cells` x `cells` parts.
+    """The area that points support, and numbers of active points in `cells` x `cells` parts.
 
     Args:
         model: of the registered scene, for the area on the ground.

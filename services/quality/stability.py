@@ -44,7 +44,7 @@ class AdjustedScene:
         model_findings: what the adjusted model, or the file that carries it, is off by.
         tie_places: (k, 2) line and sample of ties with other scenes, which hold the image as well.
         findings: what the correction does not follow; their harm is in the adjustment.
-        held: the part of the image that points hold; None before it is known.
+        held: the part of the image that points support; None before it is known.
     """
 
     model: SensorModel
@@ -66,7 +66,7 @@ class AdjustedScene:
 
     @property
     def places(self) -> Array:
-        """Line and sample (5, 2) of the corners and the centre, each moved to where points hold."""
+        """Line and sample (5, 2) of the corners and the centre, each moved to where points support."""
         places = image_places(self.shape)
         return places if self.held is None else self.held.nearest(places)
 
@@ -154,7 +154,7 @@ class Stability:
         draws: number of adjustments that succeeded.
         failed_draws: number of adjustments that gave no solution.
         held_out_per_draw: number of points held out of each draw.
-        displacements: of the four corners and the centre, each at the nearest place that points hold;
+        displacements: of the four corners and the centre, each at the nearest place that points support;
             empty when no draw succeeded.
         held_out_px: residuals of the points held out, all draws together; a point counts once for each
             draw without it.

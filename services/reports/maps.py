@@ -117,7 +117,7 @@ def residual_map(report: RegistrationReport) -> Figure:
 def coverage_map(report: RegistrationReport) -> Figure:
     """The points on the image by status and reason, and the area that they hold.
 
-    Points on the image. The outline surrounds the area that active points hold;
+    Points on the image. The outline surrounds the area that active points support;
     """
     groups = _groups(report)
     below = 8.0 + _LEGEND_ROW * ((len(groups) + 1) // 2)

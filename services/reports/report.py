@@ -214,7 +214,7 @@ class RegistrationReport:
         cell_stability: the same without the points of one cell at a time: shows errors that neighbours
             share, not those that all points share.
         predicted: accuracy by the covariance of the correction.
-        coverage: the part of the image that active points hold; accuracy is stated for it.
+        coverage: the part of the image that active points support; accuracy is stated for it.
         findings: what the correction does not follow, most harmful first; the accuracy includes them.
         checks: accuracy at points that had no part in the registration.
         marks: what became of marks of a person; null without any.

@@ -57,7 +57,7 @@ def make_quality_world(folder: Path) -> QualityWorld:
     land = texture(rng, SIDE, 1.5)
     shifted = moved(land, *SHIFT_PX)
     half = SIDE // 2
-    # Two islands of texture in the south, so that the outline of the points holds the lake.
+    # Two islands of texture in the south, so that the outline of the points supports the lake.
     for pixels in (land, shifted):
         pixels[half:, 200:-200] = 0.0
         pixels[half:-200] = 0.0

@@ -118,7 +118,7 @@ class Errors:
 
 
 def held_nodes(report: dict[str, Any], count: int) -> BoolArray:
-    """Which nodes (n,) of the predicted accuracy points hold."""
+    """Which nodes (n,) of the predicted accuracy points support."""
     nodes = nodes_of((report["scene"]["lines"], report["scene"]["samples"]))
     assert len(nodes) == count
     outline = tuple(np.array(ring) for ring in report["coverage"]["outline"])

@@ -281,7 +281,7 @@ def test_the_command_lets_a_service_register(
         on_earth = ("--max-ce90-on-earth-m", 10, "--server", url, "--token", token("register"))
         limited = amers(*scene, *on_earth)
         assert limited.returncode == 3, limited.stderr + log.read_text()
-        assert "unknown: the accuracy of the control points' frame is not stated" in limited.stderr
+        assert "unknown: the sigma of the control points' common error is not stated" in limited.stderr
         older = (folder / "report.json").read_bytes()
         refused = amers(*scene, "--server", url, "--token", "wrong")
         assert (refused.returncode, (folder / "report.json").read_bytes()) == (2, older)

@@ -75,7 +75,7 @@ def assert_stated(document: Document, is_known: bool, prefix: str = "") -> tuple
     else:
         assert (earth["ce90_m"], earth["le90_m"]) == (None, None)
         assert "CE90 unknown" in earth["words"]
-        assert earth["words"].endswith("the accuracy of the control points' frame is not stated")
+        assert earth["words"].endswith("the sigma of the control points' common error is not stated")
     return relative["words"], earth["words"]
 
 
@@ -168,7 +168,7 @@ def test_the_command_that_registers_states_both(
     report = tmp_path / "out" / "report.json"
     limited = amers(*command, "--max-ce90-on-earth-m", 10, "-o", tmp_path / "out", fails=not is_known)
     assert json.loads(report.read_text())["verdict_scope"] == f"{SCOPE} and on the Earth"
-    assert ("unknown: the accuracy of the control points' frame is not stated" in limited) == (
+    assert ("unknown: the sigma of the control points' common error is not stated" in limited) == (
         not is_known
     )
     several = tmp_path / "several"

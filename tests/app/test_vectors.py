@@ -126,7 +126,7 @@ def test_the_accuracy_of_a_registered_scene_is_stated(inputs: list[object], tmp_
     north_m = 1.0 / np.linalg.norm(MODEL.project_derivative(ground)[0, 0, :2])
     assert record["relative_to_control_points"]["ce90_m"] == pytest.approx(2.146 * north_m, rel=0.05)
     assert record["on_the_earth"]["words"].endswith(
-        "the accuracy of the control points' frame is not stated"
+        "the sigma of the control points' common error is not stated"
     )
     columns = read_layer(tmp_path / "map.gpkg").attributes
     assert columns["ce90_m"].to_pylist() == pytest.approx([2.146 * north_m] * 2, rel=0.05)

@@ -191,7 +191,7 @@ function summary(report: Report): (HTMLElement | null)[] {
       "Residual on the ground, rms": figure(ground.horizontal.rms, "m"),
       "Predicted CE90 relative to the control points, worst place": figure(predicted.worst_px, "px"),
     }),
-    h("p", { class: "quiet" }, `Accuracy is stated for the shaded part of the map (on the image: inside the thin line), ${figure(report.coverage.percent, "%")} of the image, which the points hold.`),
+    h("p", { class: "quiet" }, `Accuracy is stated for the shaded part of the map (on the image: inside the thin line), ${figure(report.coverage.percent, "%")} of the image, which the points support.`),
   ];
 }
 

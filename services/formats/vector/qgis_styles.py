@@ -99,7 +99,7 @@ LAYER_STYLES: Mapping[str, Sequence[Style]] = {
     "points": (
         NumberStyle(
             "Horizontal sigma",
-            "Standard deviation of the position in the frame of its block, the larger of east and north",
+            "Standard deviation of the position relative to its block, the larger of east and north",
             'max("sigma_east_m", "sigma_north_m")',
             (0.0, 0.5, 1.0, 2.0, 5.0, 1e6),
             "m",
@@ -111,7 +111,7 @@ LAYER_STYLES: Mapping[str, Sequence[Style]] = {
     "held_area": (
         AreaStyle(
             "Held area",
-            "The area that control points hold: accuracy is stated for it, and for no other part",
+            "The area that control points support: accuracy is stated for it, and for no other part",
             STATUS_COLOURS["active"],
         ),
     ),

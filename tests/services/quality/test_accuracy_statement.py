@@ -55,7 +55,8 @@ def test_what_blocks_differ_by_is_not_counted_as_common_to_them_again():
 def test_the_words_state_both_accuracies_in_their_order():
     assert scene_accuracy(0.114, 3.2, Frame.from_sigmas(1.5, 5.0), 100.0).lines == (
         "Relative to the control points: CE90 0.11 m (worst place of the image)",
-        "On the Earth: CE90 3.20 m (worst place of the image), LE90 of the control points' frame 8.22 m",
+        "On the Earth: CE90 3.20 m (worst place of the image), "
+        "LE90 of the control points' common error 8.22 m",
     )
     assert points_accuracy(MEDIAN_M2, Frame.from_sigmas(1.5, 5.0), "median of the points").lines == (
         "Relative to the control points: CE90 0.43 m, LE90 0.82 m (median of the points)",
@@ -69,7 +70,7 @@ def test_the_words_state_both_accuracies_in_their_order():
 def test_the_words_say_of_what_part_of_the_image_they_speak(share: float, words: str) -> None:
     stated = scene_accuracy(0.3, 3.2, Frame.from_sigmas(1.5, 5.0), share)
     for line in stated.lines:
-        assert f"(worst place of the {words} of the image that points hold)" in line
+        assert f"(worst place of the {words} of the image that points support)" in line
 
 
 def test_the_words_on_the_earth_say_what_was_assumed():
@@ -84,15 +85,17 @@ def test_the_words_on_the_earth_say_what_was_assumed():
 def test_the_words_say_what_is_unknown_and_why():
     nothing = scene_accuracy(0.11, np.nan, UNKNOWN_FRAME, 100.0).lines[1]
     assert nothing == (
-        "On the Earth: CE90 unknown (worst place of the image), LE90 of the control points' frame "
-        "unknown: the accuracy of the control points' frame is not stated"
+        "On the Earth: CE90 unknown (worst place of the image), LE90 of the control points' common "
+        "error unknown: the sigma of the control points' common error is not stated"
     )
     no_height = scene_accuracy(0.11, np.nan, Frame.from_sigmas(1.5, np.nan), 100.0).lines[1]
-    assert no_height.endswith("unknown: the height accuracy of the control points' frame is not stated")
+    assert no_height.endswith(
+        "unknown: the height sigma of the control points' common error is not stated"
+    )
     block = points_accuracy(MEDIAN_M2, Frame.from_sigmas(1.5, np.nan), "median of the points")
     assert block.lines[1] == (
-        "On the Earth: CE90 3.25 m, LE90 unknown (median of the points): the height accuracy of the "
-        "control points' frame is not stated"
+        "On the Earth: CE90 3.25 m, LE90 unknown (median of the points): the height sigma of the "
+        "control points' common error is not stated"
     )
     assert np.isnan(block.on_the_earth.le90_m)
 
@@ -102,8 +105,8 @@ def test_vertices_are_stated_by_the_worst_and_the_median_of_those_that_are_known
     stated = vertices_accuracy(relative_m, earth_m, TILTED)
     assert (stated.relative_to_control_points.ce90_m, stated.on_the_earth.ce90_m) == (4.0, 9.0)
     unknown = (
-        "unknown for 1 of 4 vertices, beyond the area of the image that control points hold, or where a "
-        "line of sight grazes the ground"
+        "unknown for 1 of 4 vertices, beyond the area of the image that control points support, or where "
+        "a line of sight grazes the ground"
     )
     assert stated.lines == (
         f"Relative to the control points: CE90 4.00 m (worst vertex), 2.00 m (median vertex); {unknown}",
@@ -124,7 +127,7 @@ def test_vertices_of_a_scene_that_is_not_registered_have_the_accuracy_of_its_mod
     in_no_frame = vertices_accuracy(np.array([1.0]), unknown[:1], UNKNOWN_FRAME).lines[1]
     assert (
         in_no_frame
-        == "On the Earth: CE90 unknown: the accuracy of the control points' frame is not stated"
+        == "On the Earth: CE90 unknown: the sigma of the control points' common error is not stated"
     )
 
 
@@ -142,6 +145,6 @@ def test_a_figure_that_is_unknown_is_null_in_a_document() -> None:
     assert document["relative_to_control_points"]["ce90_m"] == 1.0
     assert document["on_the_earth"]["ce90_m"] is None
     assert document["on_the_earth"]["le90_m"] is None
-    assert "frame is not stated" in str(document["on_the_earth"]["words"])
+    assert "common error is not stated" in str(document["on_the_earth"]["words"])
     failed = accuracy_document(no_accuracy("no point was found"))
     assert {one["words"] for one in failed.values()} == {"none: no point was found"}

@@ -1,4 +1,4 @@
-"""The part of an image that points hold: nearly all where they agree everywhere, and no more."""
+"""The part of an image that points support: nearly all where they agree everywhere, and no more."""
 
 import numpy as np
 import pytest

@@ -498,4 +498,4 @@ def test_a_frame_that_nobody_stated_does_not_meet_a_limit_on_the_earth(registere
     result = qualified(registered(), replace(DEFAULT, max_ce90_on_earth_m=1000.0))
     assert result.verdict == "failed"
     (criterion,) = [c for c in result.criteria if not c.met]
-    assert criterion.note == "unknown: the accuracy of the control points' frame is not stated"
+    assert criterion.note == "unknown: the sigma of the control points' common error is not stated"

@@ -273,7 +273,7 @@ def test_a_scene_mostly_under_clouds_is_registered_and_judged_where_it_shows(kin
     cloud = np.random.default_rng(0).normal(3500.0, 100.0, (700, 420))
     pixels[:, :420] = cloud if kind == "bright" else np.nan
     result = register_scene(with_pixels(pixels), *block())
-    # Where pixels are missing there is no image: the share that points hold is that of what is left.
+    # Where pixels are missing there is no image: the share that points support is that of what is left.
     assert (result.qualification.coverage.percent > 60.0) == (kind == "missing")
     assert kind == "missing" or result.qualification.verdict != "good"
     image, error_px = errors_px(view_of(FIRST), result)
