@@ -99,8 +99,8 @@ _DESCRIPTIONS = {
         "m",
         2,
         "The covariance of the correction and that of the control points' common error, propagated to "
-        "the ground at its true height. Radius that contains 90 % of the errors by the normal law, largest "
-        "of the grid. The option max_ce90_on_earth_m sets the limit.",
+        "the ground at its true height. Radius that contains 90 % of the errors by the normal law, "
+        "largest of the grid. The option max_ce90_on_earth_m sets the limit.",
     ),
     "unit_weight": _Description(
         "Standard deviation of unit weight",
