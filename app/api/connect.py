@@ -178,10 +178,10 @@ print(points[["saliency", "n_views", "geometry"]])
     ),
     Recipe(
         "R with sf and httr2",
-        "The first lines read the points with the GDAL library of sf. GDAL requests all pages of the "
-        "reply. The last lines use httr2 to request the points that match a CQL2 filter, and convert "
-        "the reply into a table of sf. This reply contains at most 10,000 points. The pipe `|>` needs R 4.1 "
-        "or later.",
+        "The first lines read the points with the GDAL library of sf. GDAL requests all pages of "
+        "the reply. The last lines use httr2 to request the points that match a CQL2 filter, and "
+        "convert the reply into a table of sf. This reply contains at most 10,000 points. The pipe "
+        "`|>` needs R 4.1 or later.",
         (
             Lines(
                 "r",
@@ -271,10 +271,10 @@ for item in catalog.search(collections=["scenes"], bbox=[5.22, 43.21, 5.27, 43.2
     ),
     Recipe(
         "JavaScript with fetch",
-        "The lines request the points of a bounding box as GeoJSON. A reply contains one page of at "
-        "most 1000 points. The link `next` of a page is the address of the next page. The last page has no "
-        "such link. Save the lines as `points.mjs` and run them with `node points.mjs`, in Node.js 18 "
-        "or later.",
+        "The lines request the points of a bounding box as GeoJSON. A reply contains one page of "
+        "at most 1000 points. The link `next` of a page is the address of the next page. The last "
+        "page has no such link. Save the lines as `points.mjs` and run them with `node "
+        "points.mjs`, in Node.js 18 or later.",
         (
             Lines(
                 "javascript",
@@ -297,9 +297,9 @@ for (const { id, geometry, properties } of points.slice(0, 3)) {
             ),
         ),
         "The lines also work in a script of type `module` on a web page. There, replace "
-        "`process.env.TOKEN` by a token that the user enters. Do not write a token into the page, because "
-        "every visitor could read it. A page of another site can call the service only if the "
-        "setting `AMERS_CORS_ORIGINS` of the service names this site.",
+        "`process.env.TOKEN` by a token that the user enters. Do not write a token into the page, "
+        "because every visitor could read it. A page of another site can call the service only if "
+        "the setting `AMERS_CORS_ORIGINS` of the service names this site.",
     ),
 )
 

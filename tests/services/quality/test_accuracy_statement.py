@@ -105,8 +105,8 @@ def test_vertices_are_stated_by_the_worst_and_the_median_of_those_that_are_known
     stated = vertices_accuracy(relative_m, earth_m, TILTED)
     assert (stated.relative_to_control_points.ce90_m, stated.on_the_earth.ce90_m) == (4.0, 9.0)
     unknown = (
-        "unknown for 1 of 4 vertices, beyond the area of the image that control points support, or where "
-        "a line of sight grazes the ground"
+        "unknown for 1 of 4 vertices, beyond the area of the image that control points support, or "
+        "where a line of sight grazes the ground"
     )
     assert stated.lines == (
         f"Relative to the control points: CE90 4.00 m (worst vertex), 2.00 m (median vertex); {unknown}",
