@@ -20,7 +20,9 @@ _INLINE = ("a", "b", "code", "small", "span")
 def format_text(page: Page, report: Any) -> str:
     """A report as plain text."""
     text = io.StringIO()
-    _print(page, report, Console(file=text, width=_WIDTH, no_color=True, force_terminal=False))
+    # In a notebook, rich would otherwise show the report below the cell instead of writing it.
+    console = Console(file=text, width=_WIDTH, no_color=True, force_terminal=False, force_jupyter=False)
+    _print(page, report, console)
     return text.getvalue()
 
 

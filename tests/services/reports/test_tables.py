@@ -38,6 +38,13 @@ def test_the_table_of_point_counts_has_the_published_columns_and_the_counts(mate
     ]
 
 
+def test_a_report_is_written_and_not_shown_where_the_program_is_a_notebook(report, monkeypatch, capsys):
+    text = format_text(REGISTRATION_PAGE, report)
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    assert format_text(REGISTRATION_PAGE, report) == text != ""
+    assert capsys.readouterr().out == ""
+
+
 def test_the_residual_table_says_mean_and_deviation_of_each_coordinate(material):
     made = material()
     residual = made.measures.residual_px[made.measures.active]
