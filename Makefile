@@ -16,7 +16,7 @@ PYTEST := $(BIN)/python -m pytest -p no:schemathesis --dist loadfile --no-loadsc
 APART := not endurance and not qgis
 LONG := cape_verde continent distorted real_scenes faults image_selection load stress throughput block_adjustment block_parts toutin
 
-.PHONY: demo test test-thorough test-files test-operations test-shuffled test-fast test-security test-endurance test-qgis check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput mutants mutants-changed postgis page chromium proxies pictures plugin release
+.PHONY: demo test test-thorough test-files test-operations test-shuffled test-fast test-security test-endurance test-qgis check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput mutants mutants-changed postgis page chromium proxies pictures notebooks plugin release
 
 demo: postgis page
 	@$(BIN)/amers demo
@@ -89,6 +89,10 @@ mutants-changed: postgis
 
 pictures: page chromium
 	$(BIN)/python scripts/make_pictures.py demo-output
+
+# Runs the notebooks of the examples and writes their outputs; NAME=register_scene runs one. Minutes.
+notebooks: $(READY)
+	$(BIN)/python -m scripts.run_notebooks $(NAME)
 
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
