@@ -22,11 +22,12 @@ router = APIRouter(include_in_schema=False, route_class=CallerRoute)
 
 TITLE = "Connect"
 INTRODUCTION = (
-    "Copy-and-paste examples for common clients of an Amers service. Requests for points need a token "
-    "of scope `read`, requests for scenes a token of scope `register`. An administrator creates tokens "
-    "with `amers token create`. If the points of the service are public, leave the token out. The tests "
-    "of Amers run these examples against a service and fill in the forms of QGIS. An example states if "
-    "the tests need more software to run it than Amers installs."
+    "This page contains copy-and-paste examples for common clients of an Amers service. Requests for "
+    "points need a token of scope `read`; requests for scenes need a token of scope `register`. Ask "
+    "the administrator of the service for a token: the command `amers token create` makes one. If the "
+    "points of the service are public, leave the token out. The examples are tested: the tests of "
+    "Amers run them against a service and fill in the forms of QGIS. If such a test needs software "
+    "that Amers does not install, the example names this software."
 )
 EXAMPLE = "https://gcp.example.org"
 """The address of the service in the documentation."""
@@ -87,8 +88,9 @@ RECIPES = (
         "The token, once",
         "Run these two commands first. The first command waits until you paste the token, and stores it "
         "in the variable `TOKEN`. The second command writes the token into the file `amers-header`, "
-        "which only you can read. The other examples use the variable or the file. So the token never "
-        "appears on a command line, where other users of the machine could see it.",
+        "which only you can read. The other examples read the token from the variable or from the file. "
+        "Therefore the token never appears on a command line, where other users of the machine could "
+        "see it.",
         (
             Lines("bash", "read -rs TOKEN && export TOKEN"),
             Lines("bash", '(umask 077 && echo "Authorization: Bearer $TOKEN" > amers-header)'),
@@ -113,9 +115,10 @@ curl -f -H @amers-header -G BASE/collections/points/items -d f=parquet \\
     ),
     Recipe(
         "GDAL 3.6 and 3.12",
-        "`ogrinfo` describes the layer of points, and `ogr2ogr` writes selected points into a "
-        "GeoPackage. The service evaluates the box and the condition, so only the selected points are "
-        "transferred. `GDAL_HTTP_HEADER_FILE` works with both versions of GDAL.",
+        "`ogrinfo` describes the layer of points. `ogr2ogr` writes points into a GeoPackage: the points "
+        "inside the box of `-spat` for which the condition of `-where` is true. The service selects the "
+        "points, so only these points are transferred. The option `GDAL_HTTP_HEADER_FILE`, which names "
+        "the file with the token, works in both versions of GDAL.",
         (
             Lines(
                 "bash",
@@ -135,10 +138,11 @@ ogr2ogr -spat 5.22 43.21 5.27 43.26 -where "saliency > 0.3" points.gpkg OAPIF:BA
         "any user name, and the token as password. From QGIS 3.24 on, you can instead use the method "
         "*API Header* with the name `Authorization` and the value `Bearer TOKEN`.",
         (Lines("text", "URL      BASE\nVersion  OGC API - Features"),),
-        "*Connect* lists the layers `points`, `blocks` and `density`. The option *Only request features "
-        "overlapping the view extent* keeps requests small. Vector tiles display many points faster. To "
-        "use them, choose *Add Vector Tile Layer*, *New Generic Connection*, with the same "
-        "authentication and the address `BASE/collections/points/tiles/WebMercatorQuad/{z}/{y}/{x}`.",
+        "The button *Connect* lists the layers `points`, `blocks` and `density`. Switch on the option "
+        "*Only request features overlapping the view extent*, so that QGIS requests only the visible "
+        "points. To display very many points, vector tiles are faster. To use vector tiles, choose "
+        "*Add Vector Tile Layer*, *New Generic Connection*, with the same authentication and the "
+        "address `BASE/collections/points/tiles/WebMercatorQuad/{z}/{y}/{x}`.",
     ),
     Recipe(
         "QGIS plugin of Amers",
@@ -155,8 +159,8 @@ ogr2ogr -spat 5.22 43.21 5.27 43.26 -where "saliency > 0.3" points.gpkg OAPIF:BA
     ),
     Recipe(
         "geopandas 1",
-        "geopandas reads the points with the GDAL library of pyogrio. The service evaluates the box and "
-        "the condition.",
+        "geopandas reads the points with the GDAL library of pyogrio. The service selects the points "
+        "that are inside the box `bbox` and for which the condition `where` is true.",
         (
             Lines(
                 "python",
@@ -178,10 +182,10 @@ print(points[["saliency", "n_views", "geometry"]])
     ),
     Recipe(
         "R with sf and httr2",
-        "The first lines read the points with the GDAL library of sf. GDAL requests all pages of "
-        "the reply. The last lines use httr2 to request the points that match a CQL2 filter, and "
-        "convert the reply into a table of sf. This reply contains at most 10,000 points. The pipe "
-        "`|>` needs R 4.1 or later.",
+        "The first example reads the points of a box with the GDAL library of sf. GDAL requests all "
+        "pages of the reply. The second example uses httr2 to request the points that match a CQL2 "
+        "filter, and converts the reply into a table of sf. This reply contains at most 10,000 points."
+        " The pipe `|>` needs R 4.1 or later.",
         (
             Lines(
                 "r",
@@ -211,10 +215,10 @@ print(nrow(salient))
     ),
     Recipe(
         "Python client of Amers",
-        "The client reads points and blocks, uploads scenes, starts registrations and downloads their "
-        "results. It requests all pages of a reply by itself. The client is part of Amers. Without "
-        "Amers, install the package amers-client, which needs only httpx, and write `from amers_client "
-        "import Client`.",
+        "The class `Client` reads points and blocks, uploads scenes, starts registrations and downloads "
+        "the results of registrations. If a reply has several pages, the client requests all of them. "
+        "The client is part of Amers. On a machine without Amers, install the package amers-client, "
+        "which needs only httpx, and write `from amers_client import Client`.",
         (
             Lines(
                 "python",
@@ -233,8 +237,8 @@ print(len(points), "points;", *[block["properties"]["title"] for block in blocks
     ),
     Recipe(
         "OWSLib",
-        "OWSLib lists collections and reads features. Its module `owslib.ogcapi.processes` starts "
-        "registrations; the address and the header are the same.",
+        "The example reads ten points of a box. To start registrations with OWSLib, use the class "
+        "`Processes` of the module `owslib.ogcapi.processes` with the same address and header.",
         (
             Lines(
                 "python",
@@ -252,8 +256,8 @@ print(page["numberMatched"], [feature["id"] for feature in page["features"]])
     ),
     Recipe(
         "pystac-client",
-        "pystac-client reads your scenes, with their verdicts, as items of a STAC catalogue. The token "
-        "needs scope `register`.",
+        "pystac-client reads the scenes that you uploaded as items of a STAC catalogue. The example "
+        "prints the verdict of the registration of each scene. The token needs scope `register`.",
         (
             Lines(
                 "python",
@@ -271,10 +275,10 @@ for item in catalog.search(collections=["scenes"], bbox=[5.22, 43.21, 5.27, 43.2
     ),
     Recipe(
         "JavaScript with fetch",
-        "The lines request the points of a bounding box as GeoJSON. A reply contains one page of "
-        "at most 1000 points. The link `next` of a page is the address of the next page. The last "
-        "page has no such link. Save the lines as `points.mjs` and run them with `node "
-        "points.mjs`, in Node.js 18 or later.",
+        "The script requests the points of a bounding box as GeoJSON. A reply contains one page of at "
+        "most 1,000 points. The link `next` of a page is the address of the next page. The last page "
+        "has no such link. Save the lines as `points.mjs` and run them with `node points.mjs`, in "
+        "Node.js 18 or later.",
         (
             Lines(
                 "javascript",
@@ -296,10 +300,10 @@ for (const { id, geometry, properties } of points.slice(0, 3)) {
 """,
             ),
         ),
-        "The lines also work in a script of type `module` on a web page. There, replace "
+        "The same code works in a script of type `module` on a web page. There, replace "
         "`process.env.TOKEN` by a token that the user enters. Do not write a token into the page, "
-        "because every visitor could read it. A page of another site can call the service only if "
-        "the setting `AMERS_CORS_ORIGINS` of the service names this site.",
+        "because every visitor could read it. A page of another site can call the service only if the "
+        "setting `AMERS_CORS_ORIGINS` of the service names this site.",
     ),
 )
 
