@@ -1,7 +1,8 @@
 """Make the pictures of the documents from a folder of `make demo`: report, map and marks.
 
-    python scripts/make_pictures.py FOLDER
+    python scripts/make_pictures.py FOLDER [PICTURES]
 
+PICTURES is the folder to write into, by default docs/pictures.
 Chromium draws them (`scripts/ensure-chromium`); the map needs the page (`make page`).
 """
 
@@ -31,24 +32,24 @@ MARKS = 6
 WRONG_PX = 25.0
 
 
-def main(folder: Path) -> None:
-    """Write all pictures into docs/pictures."""
-    PICTURES.mkdir(exist_ok=True)
+def main(folder: Path, pictures: Path = PICTURES) -> None:
+    """Write all pictures of a demonstration into a folder."""
+    pictures.mkdir(exist_ok=True)
     with sync_playwright() as driver, service_of(folder / "block") as (address, secret):
         software_drawing = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
         browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=software_drawing)
         page = browser.new_page(viewport=SIZE, color_scheme="light")
         page.goto((folder / "registered" / "report.html").absolute().as_uri())
-        keep(page, "report.jpg")
+        keep(page, pictures / "report.jpg")
         points = httpx.get(f"{address}/collections/points/items", params={"limit": 1}).json()
         page.goto(f"{address}/map#/points")
         page.get_by_role("link", name=str(points["features"][0]["id"])).click()
         page.wait_for_load_state("networkidle")
         page.wait_for_timeout(DRAWING_MS)
-        keep(page, "map.jpg")
+        keep(page, pictures / "map.jpg")
         page.set_viewport_size(WIDE)
         mark(page, address, secret, folder)
-        keep(page, "marks.jpg")
+        keep(page, pictures / "marks.jpg")
         browser.close()
 
 
@@ -82,10 +83,10 @@ def mark(page: Page, address: str, secret: str, folder: Path) -> None:
     page.wait_for_timeout(DRAWING_MS)
 
 
-def keep(page: Page, name: str) -> None:
+def keep(page: Page, path: Path) -> None:
     """Write what a page shows as a small picture."""
-    page.screenshot(path=PICTURES / name, type="jpeg", quality=QUALITY)
-    print(f"{name}: {(PICTURES / name).stat().st_size / 1024.0:.0f} KiB")
+    page.screenshot(path=path, type="jpeg", quality=QUALITY)
+    print(f"{path.name}: {path.stat().st_size / 1024.0:.0f} KiB")
 
 
 @contextmanager
@@ -130,6 +131,6 @@ def wait_for(address: str) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2:
+    if len(sys.argv) not in (2, 3):
         sys.exit(__doc__)
-    main(Path(sys.argv[1]))
+    main(*map(Path, sys.argv[1:]))

@@ -17,7 +17,9 @@ from amers.services.formats.sensor_models.rpc_files import read_rpc
 from amers.services.formats.sensor_models.rpc_text import format_rpb
 from tests.command_line import Done, amers_here, amers_process
 from tests.documents import blocks_of
+from tests.journeys.map_page import BUILT
 from tests.service_process import Service, until
+from tests.similar_pictures import MOST_CHANGED, changed_share, grey
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
@@ -64,6 +66,23 @@ def test_the_report_is_at_the_printed_path(demo):
     manifest = json.loads((report.parent / "manifest.json").read_text())
     files = {path.name for path in report.parent.iterdir()}
     assert files == {*manifest["files"], "manifest.json"}, "a whole result, as any registration leaves"
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium: run `make chromium`")
+@pytest.mark.skipif(not BUILT.is_file(), reason="the page is not built: run `make page`")
+def test_the_pictures_of_the_documents_show_the_pages_as_they_are(demo, tmp_path):
+    folder = Path(demo["report"]).parents[1]
+    program = README.parent / "scripts" / "make_pictures.py"
+    environment = {**os.environ, "PYTHONPATH": str(README.parent)}
+    words = [sys.executable, program, folder, tmp_path / "pictures"]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    kept = sorted((README.parent / "docs" / "pictures").glob("*.jpg"))
+    made = {
+        path.name: changed_share(grey(path), grey(tmp_path / "pictures" / path.name)) for path in kept
+    }
+    changed = {name: f"{share:.1%}" for name, share in made.items() if share > MOST_CHANGED}
+    assert not changed, f"{changed} of docs/pictures changed: run `make demo pictures`, look at them"
 
 
 def test_a_folder_that_holds_something_else_is_left_alone(tmp_path):
