@@ -11,6 +11,7 @@ import { notesOn, StatedFields, verdictOn } from "./marks_accuracy";
 import { PointChip, pointOnGround } from "./marks_point";
 import { referenceChoice } from "./marks_reference";
 import { MarksTable } from "./marks_table";
+import { beyond, groundText, imageText, inOrder, shown } from "./marks_typed";
 import { announce, go } from "./page";
 import { run, stateText } from "./processes";
 import type { Pixel } from "./shapes";
@@ -261,8 +262,8 @@ class Marking {
     try {
       const half: { image?: InImage; ground?: OnGround } = {};
       const { image, ground } = this.begun;
-      if (this.image.value.trim() && this.image.value !== imageText(image)) half.image = this.shown(parseInImage(this.image.value));
-      if (this.ground.value.trim() && this.ground.value !== groundText(ground)) half.ground = this.inside(parseOnGround(this.ground.value));
+      if (this.image.value.trim() && this.image.value !== imageText(image)) half.image = shown(parseInImage(this.image.value), this.model);
+      if (this.ground.value.trim() && this.ground.value !== groundText(ground)) half.ground = inOrder(parseOnGround(this.ground.value), this.outline);
       if (!half.image && !half.ground && this.completed() === this.marks) throw new Error(image && ground ? "A height is missing: add it after longitude and latitude." : "A place in the image or on the ground is missing.");
       this.isTyped ||= half.ground !== undefined;
       this.choose(half);
@@ -270,31 +271,6 @@ class Marking {
     } catch (error) {
       this.refuse(error);
     }
-  }
-
-  /** A typed place in the image. */
-  private shown(image: InImage): InImage {
-    if (this.beyond(image) > 0) throw new Error(`Place in the image: line ${image.line}, sample ${image.sample} found; the image has ${this.model.lines} lines and ${this.model.samples} samples.`);
-    return image;
-  }
-
-  /** How far a place lies beyond the image, pixels. */
-  private beyond({ line, sample }: InImage): number {
-    const { lines, samples } = this.model;
-    return Math.max(-line - CENTRE, line - lines + CENTRE, -sample - CENTRE, sample - samples + CENTRE, 0);
-  }
-
-  /** A typed place, unless it lies in the scene with longitude and latitude exchanged alone. */
-  private inside(ground: OnGround): OnGround {
-    const within = (lon: number, lat: number): boolean => {
-      const [lons, lats] = [this.outline.map((place) => place[0]!), this.outline.map((place) => place[1]!)];
-      const margin = 1;
-      return lon > Math.min(...lons) - margin && lon < Math.max(...lons) + margin && lat > Math.min(...lats) - margin && lat < Math.max(...lats) + margin;
-    };
-    if (this.outline.length && !within(ground.lon, ground.lat) && within(ground.lat, ground.lon)) {
-      throw new Error("Place on the ground: longitude and latitude are exchanged; longitude comes first.");
-    }
-    return ground;
   }
 
   private refuse(error: unknown): void {
@@ -422,7 +398,7 @@ class Marking {
       return;
     }
     const radius = CE90_SIGMAS * (sigma ?? AROUND_PX);
-    if (line == null || sample == null || this.beyond({ line, sample }) > radius) {
+    if (line == null || sample == null || beyond({ line, sample }, this.model) > radius) {
       this.prompt.textContent = `${this.chosen}The image does not show this place.`;
       return;
     }
@@ -486,18 +462,4 @@ function pixel({ line, sample }: InImage): Pixel {
 
 function feature({ lon, lat }: OnGround, properties: object): Feature {
   return { type: "Feature", properties: { ...properties }, geometry: { type: "Point", coordinates: [lon, lat] } };
-}
-
-function imageText(image: InImage | null): string {
-  return image ? `${round(image.line, 3)}, ${round(image.sample, 3)}` : "";
-}
-
-function groundText(ground: OnGround | null): string {
-  if (!ground) return "";
-  const height = ground.height_m == null ? "" : `, ${round(ground.height_m, 3)}`;
-  return `${round(ground.lon, 8)}, ${round(ground.lat, 8)}${height}`;
-}
-
-function round(value: number, decimals: number): number {
-  return Number(value.toFixed(decimals));
 }
