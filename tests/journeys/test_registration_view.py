@@ -25,6 +25,10 @@ from tests.service_process import Service, until
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
+an_outline_px = 40
+"""By which an outline is larger than the part of the image that has points."""
+brown = 30.0
+"""Green above blue: more than any ground of the map has, less than the dashes of an outline."""
 a_visible_difference = 5.0
 as_good_as_equal = 1.0
 """Mean differences of grey values from 0 to 255."""
@@ -153,6 +157,45 @@ def test_the_outline_on_the_map_is_that_of_the_pixels_that_are_shown(visit, secr
     assert dashes.any(axis=0).sum() > WIDE["width"] / 10
 
 
+def outline_extent_px(page: Page) -> int:
+    """Height of what the map shows in the brown of outlines and of the edge of the part with points."""
+    page.wait_for_timeout(10 * poll_ms)
+    until_drawn(page)
+    picture = imread(io.BytesIO(page.locator("#map").screenshot()))[:, :, :3] * 255
+    rows = np.flatnonzero((picture[:, :, 1] - picture[:, :, 2] > brown).any(axis=1))
+    return int(np.ptp(rows)) if len(rows) else 0
+
+
+def test_the_outline_of_a_scene_is_shown_once_that_of_its_pixels_is_known(
+    visit, secret, service, world, client
+):
+    """The one over all heights of the ground is never drawn: it lies beside the pixels."""
+    job = registered(service, secret, world, "outlined.tif")
+    scene = client.get(f"/jobs/{job}").json()["inputs"]["scene"]
+    page = visit(f"#/job/{job}", secret, WIDE)
+    places = {f"#/job/{job}": page.get_by_role("table"), f"#/scene/{scene}": page.locator(".facts")}
+
+    def drawn_px() -> list[int]:
+        found = []
+        for place, part in places.items():
+            page.goto(f"{service.url}/map{place}")
+            page.reload()
+            expect(part.first).to_be_visible()
+            found.append(outline_extent_px(page))
+        return found
+
+    before = drawn_px()
+    page.screenshot(path=ARTEFACTS / "outline-unknown.png")
+    inputs = {"scene": scene, "registration": job}
+    drawing = client.post("/processes/map-scene/execution", json={"inputs": inputs}).json()["jobID"]
+    assert until(lambda: client.get(f"/jobs/{drawing}").json()["status"] == "successful")
+    after = drawn_px()
+    page.screenshot(path=ARTEFACTS / "outline-known.png")
+    gained = np.subtract(after, before)
+    assert before[1] == 0
+    assert (gained > an_outline_px).all(), (before, after)
+
+
 def test_a_failed_job_leads_to_its_scene(visit, secret, world, client, tmp_path):
     noise = tmp_path / "noise.tif"
     with rasterio.open(world.tagged) as image:
@@ -165,6 +208,7 @@ def test_a_failed_job_leads_to_its_scene(visit, secret, world, client, tmp_path)
     page = visit(f"#/job/{asked.json()['jobID']}", secret, WIDE)
     expect(page.locator(".badge")).to_have_text("failed")
     expect(page.locator("#panel h1")).to_have_text("noise.tif")
+    expect(page.locator(".maplibregl-ctrl-scale")).to_have_text(re.compile(r"^\d+ m$"))
     assert_readable(page, "job-failed")
     page.set_viewport_size(WIDE)
     page.get_by_role("link", name="Go to the scene").click()

@@ -4,17 +4,22 @@ import type { Feature, FeatureCollection, Geometry, Point, Polygon, Position } f
 import { blobUrl, call, get } from "./api";
 import type { Atlas } from "./atlas";
 import { drawBlocks } from "./blocks";
-import type { ResultFile, StatusInfo } from "./api_types";
+import type { ResultFile, Scene, StatusInfo } from "./api_types";
 import { accuracy, badge, facts, figure, fill, h, problem, when } from "./elements";
 import { announce, markSection, pause } from "./page";
+import { outlineOf } from "./pictures";
 import { ended, find, stateText } from "./processes";
 import type { Criterion, Report } from "./report_types";
 import { imageOnMap } from "./image_on_map";
 import { type PointResultProperties, residualArrows, showResidualLegend } from "./residuals";
+import { outlines } from "./scenes";
 import { surfaceOnMap } from "./surface";
 import type { Place, ShowView } from "./view";
 
 const POLL_MS = 1000;
+const CLOSEST_ZOOM = 17;
+/** Scenes of a job that failed whose places are read. */
+const MOST_SCENES = 30;
 
 type Results = Record<string, ResultFile>;
 
@@ -47,8 +52,22 @@ export const showJob: ShowView = async (place, id) => {
   }
   announce(`The job is ${job.status}.`);
   if (job.status === "successful") await showResults(place, job, body);
-  else fill(body, outcome(job), await failureReport(job, signal), nextStep(scenes));
+  else {
+    fill(body, outcome(job), await failureReport(job, signal), nextStep(scenes));
+    place.atlas.fit(await groundOf(job, scenes, signal), CLOSEST_ZOOM);
+  }
 };
+
+/** What is known of the ground of the scenes of a job without a result: by its report, else by earlier registrations. */
+async function groundOf(job: StatusInfo, scenes: string[], signal: AbortSignal): Promise<FeatureCollection> {
+  const file = job.links.find(({ title }) => title === "report.json");
+  // Scenes and files may have been removed meanwhile: the map stays where it is then.
+  const report = file ? await get<Partial<Report>>(file.href, signal).catch(() => null) : null;
+  const ring = report?.scene?.footprint_lon_lat as Position[] | undefined;
+  if (ring?.length) return { type: "FeatureCollection", features: [{ type: "Feature", properties: {}, geometry: { type: "Polygon", coordinates: [ring] } }] };
+  const known = await Promise.all(scenes.slice(0, MOST_SCENES).map((id) => get<Scene>(`scenes/${id}`, signal).catch(() => null)));
+  return { type: "FeatureCollection", features: outlines(known.filter((scene) => scene !== null)) };
+}
 
 function progressOf(first: StatusInfo): { element: HTMLElement; update(job: StatusInfo): void } {
   const bar = h("progress", { max: 100, "aria-label": "Progress of the job" });
@@ -105,11 +124,12 @@ async function showResults(place: Place, job: StatusInfo, body: HTMLElement): Pr
     if (blockLink(results)) await showIngested(atlas, results, signal);
     return;
   }
-  const [report, points] = await Promise.all([
+  const [report, points, outline] = await Promise.all([
     get<Report>(reportFile.href, signal),
     get<FeatureCollection<Point, PointResultProperties>>(pointsFile.href, signal),
+    outlineOf(job, signal).catch(() => null),
   ]);
-  const onMap = await showRegistration(place, report, points);
+  const onMap = await showRegistration(place, report, points, outline);
   fill(
     body,
     ...summary(report),
@@ -120,14 +140,15 @@ async function showResults(place: Place, job: StatusInfo, body: HTMLElement): Pr
   );
 }
 
-/** Draw the outline, the points and their residuals; what draws the points over an image, or leaves them out. */
+/** Draw the outline if it is known, the points and their residuals; what draws the points over an image, or leaves them out. */
 async function showRegistration(
   { atlas, signal }: Place,
   report: Report,
   points: FeatureCollection<Point, PointResultProperties>,
+  outline: Polygon | null,
 ): Promise<{ overImage: (withPoints: boolean) => void }> {
-  const ring = report.scene.footprint_lon_lat as Position[];
-  const footprint: Polygon = { type: "Polygon", coordinates: [[...ring, ring[0]!]] };
+  // Over all heights of the ground: larger than the image where the ground has relief.
+  const footprint: Polygon = { type: "Polygon", coordinates: [report.scene.footprint_lon_lat as Position[]] };
   const { features, exaggeration } = residualArrows(points);
   const areas = (report.coverage.polygons_lon_lat ?? []) as Position[][][];
   const held = (geometry: Geometry): Feature => ({ type: "Feature", properties: { status: "held" }, geometry });
@@ -138,10 +159,10 @@ async function showRegistration(
   void atlas.hidePoints(signal);
   showLegend();
   await Promise.all([
-    atlas.show("scenes", [{ type: "Feature", properties: {}, geometry: footprint }]),
+    atlas.show("scenes", outline ? [{ type: "Feature", properties: {}, geometry: outline }] : []),
     atlas.show("vectors", [held({ type: "MultiPolygon", coordinates: areas }), ...features]),
   ]);
-  atlas.fit(footprint, 17);
+  atlas.fit(outline ?? footprint, CLOSEST_ZOOM);
   return {
     // The image has outlines of its own, and is not shaded.
     overImage(withPoints) {

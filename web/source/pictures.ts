@@ -1,13 +1,13 @@
 // What may stand on either side of the divider: this scene, references, chips of the points, other registered scenes.
 
-import type { FeatureCollection, Geometry, Point, Position } from "geojson";
+import type { FeatureCollection, Geometry, Point, Polygon, Position } from "geojson";
 import { BASE, get } from "./api";
 import type { PointWithViews, Reference, References, Scene, StatusInfo } from "./api_types";
 import type { Bounds, Patch, Picture, Pyramid } from "./comparison";
 import { figure } from "./elements";
 import { everyRow } from "./following";
 import { metresPerDegree } from "./ground";
-import { drawn, stateText } from "./processes";
+import { drawn, drawnEarlier, stateText } from "./processes";
 import type { PointResultProperties } from "./residuals";
 
 const PROCESS = "map-scene";
@@ -46,6 +46,15 @@ export async function drawScene(
   const mapped = results as unknown as Mapped;
   const picture = (model: "raw" | "registered", name: string): Picture => ({ name, pyramid: pyramid(job, model, mapped), outline: mapped.outlines?.[model] ?? [] });
   return { mapped, raw: picture("raw", "Raw"), registered: picture("registered", "Registered") };
+}
+
+/** The edge of the pixels of a registered scene; null where its image was never drawn: no other outline fits the pixels. */
+export async function outlineOf(registration: StatusInfo, signal: AbortSignal): Promise<Polygon | null> {
+  const { scene, model } = registration.inputs;
+  if (registration.processID !== "register-scene") return null;
+  const earlier = await drawnEarlier(PROCESS, { scene, registration: registration.jobID, model: model ?? null }, signal);
+  const ring = (earlier?.results as Mapped | undefined)?.outlines?.registered;
+  return ring?.length ? { type: "Polygon", coordinates: [[...ring, ring[0]!]] } : null;
 }
 
 /** References that show some ground, the finest first, chips of the points of a registration, and other scenes. */

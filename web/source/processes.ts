@@ -24,26 +24,34 @@ export function stateText(job: StatusInfo): string {
   return end ? `${state} · expected to end on ${when(end)}` : state;
 }
 
+export interface Drawn {
+  job: StatusInfo;
+  results: Record<string, unknown>;
+}
+
 /** A job with some inputs and its results: an earlier one, or a new one, whose state `report` gets. */
-export async function drawn(
-  process: string,
-  inputs: Record<string, unknown>,
-  signal: AbortSignal,
-  report: (job: StatusInfo) => void,
-): Promise<{ job: StatusInfo; results: Record<string, unknown> }> {
-  const resultsOf = (job: StatusInfo): Promise<Record<string, unknown>> => get(`jobs/${job.jobID}/results`, signal);
-  const { jobs } = await get<Jobs>(`jobs?processID=${process}&status=successful&limit=100`, signal);
-  const earlier = jobs.find((job) => Object.entries(inputs).every(([name, value]) => (job.inputs[name] ?? null) === value));
-  if (earlier) {
-    try {
-      return { job: earlier, results: await resultsOf(earlier) };
-    } catch (error) {
-      // Its results were removed.
-      if (!(error instanceof Refused)) throw error;
-    }
-  }
+export async function drawn(process: string, inputs: Record<string, unknown>, signal: AbortSignal, report: (job: StatusInfo) => void): Promise<Drawn> {
+  const earlier = await drawnEarlier(process, inputs, signal);
+  if (earlier) return earlier;
   const job = await run(process, inputs, signal, report);
-  return { job, results: await resultsOf(job) };
+  return { job, results: await resultsOf(job, signal) };
+}
+
+/** A job that ended with some inputs, and its results; null where there is none, or its results were removed. */
+export async function drawnEarlier(process: string, inputs: Record<string, unknown>, signal: AbortSignal): Promise<Drawn | null> {
+  const { jobs } = await get<Jobs>(`jobs?processID=${process}&status=successful&limit=100`, signal);
+  const job = jobs.find((one) => Object.entries(inputs).every(([name, value]) => (one.inputs[name] ?? null) === value));
+  if (!job) return null;
+  try {
+    return { job, results: await resultsOf(job, signal) };
+  } catch (error) {
+    if (error instanceof Refused) return null;
+    throw error;
+  }
+}
+
+function resultsOf({ jobID }: StatusInfo, signal: AbortSignal): Promise<Record<string, unknown>> {
+  return get(`jobs/${jobID}/results`, signal);
 }
 
 /** Run a process to its end; an unsuccessful one is thrown in the words of the service. */

@@ -9,6 +9,8 @@ import { type Following, pageOf } from "./following";
 import { listing, type Order } from "./listing";
 import { go } from "./page";
 import { place as placeName } from "./places";
+import { outlineOf } from "./pictures";
+import { find } from "./processes";
 import { send, uploadBeside } from "./upload";
 import type { Place, ShowView } from "./view";
 
@@ -81,8 +83,11 @@ function next(words: string): HTMLElement {
 export const showScene: ShowView = async ({ panel, atlas, signal }, id) => {
   const scene = await get<Scene>(`scenes/${encodeURIComponent(id)}`, signal);
   const [last] = scene.registrations;
-  await atlas.show("scenes", outlines([scene]));
-  atlas.fit(scene.footprint);
+  const registration = scene.removed ? undefined : scene.registrations.find(({ outcome: word }) => word === "registered");
+  const outline = registration ? await find(registration.job, signal).then((job) => outlineOf(job, signal)).catch(() => null) : null;
+  signal.throwIfAborted();
+  await atlas.show("scenes", outlines([{ ...scene, footprint: outline }]));
+  atlas.fit(outline ?? scene.footprint);
   fill(
     panel,
     h("p", {}, h("a", { href: "#/scenes" }, "← Scenes")),
