@@ -88,8 +88,11 @@ class _AnyText(str):
         return super().__getitem__(key) if isinstance(key, slice) else _AnyText(f"{self}[{key}]")
 
     def get(self, key: str, default: Any = None) -> Any:
-        """A member; what stands for none, where one is given."""
-        return self[key] if default is None else default
+        """A member; what stands for none, where one is given: then that it was asked for is told."""
+        if default is None:
+            return self[key]
+        Anything.called(f"{self}.get", {0: key, 1: default})
+        return default
 
     def __iter__(self) -> Iterator[Any]:
         return iter([_AnyText(f"{self}[{number}]") for number in range(2)])
