@@ -92,8 +92,8 @@ class HeightOptions(TerrainOptions):
             )
         if self.exclude_heights or self.land_cover or self.vertical or self.geoid:
             raise InputError(
-                "--exclude-heights, --land-cover, --vertical, --geoid: of the heights of --dem, which "
-                "is missing; add it"
+                "--exclude-heights, --land-cover, --vertical, --geoid: given without --dem, whose "
+                "heights they describe; add --dem FILE, or leave them out"
             )
         return None
 

@@ -46,7 +46,10 @@ def renew(
     Readers get the new version only after `amers block publish`.
     """
     if not job and not image:
-        raise InputError("no scene given: name registered ones with --job or --image")
+        raise InputError(
+            "no scene given: name registered images with --image FILE, or registration jobs with --job "
+            "ID"
+        )
     settings = read_settings()
     storage = open_storage(settings)
     with transaction(settings):

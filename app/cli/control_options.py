@@ -79,7 +79,9 @@ class MarkOptions:
             if field.name != "control" and getattr(self, field.name) not in (None, ())
         ]
         if alone:
-            raise InputError(f"{', '.join(alone)}: of --control, which is missing; add it")
+            raise InputError(
+                f"{', '.join(alone)}: given without --control; add --control FILE, or leave this out"
+            )
         return None
 
 
@@ -166,7 +168,10 @@ class ControlOptions:
         names = [f"{file}_{statement}" for statement in statements]
         alone = [option_name(name) for name in names if getattr(self, name) is not None]
         if alone and not getattr(self, file):
-            raise InputError(f"{', '.join(alone)}: of {option_name(file)}, which is missing; add it")
+            raise InputError(
+                f"{', '.join(alone)}: given without {option_name(file)}; add {option_name(file)}, "
+                "or leave this out"
+            )
 
 
 def _point_statements(options: MarkOptions | ControlOptions) -> PointStatements:

@@ -49,7 +49,8 @@ def _empty_folder(folder: Path) -> Path:
     if folder.exists() and any(folder.iterdir()):
         if not (folder / MARK).is_file():
             raise InputError(
-                f"--output: {folder} has files of something else than the demonstration; choose another"
+                f"--output: {folder} contains files that `amers demo` did not write; name an empty or "
+                "new folder"
             )
         # Only what a demonstration made there: the link may lead elsewhere by now.
         store = (folder / STORE).resolve()

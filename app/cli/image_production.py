@@ -63,7 +63,10 @@ class ImageOptions:
             InputError: names what is wrong.
         """
         if bool(self.images) + (self.catalogue is not None) + (self.selection is not None) != 1:
-            raise InputError("images, or one of --catalogue and --selection, are expected")
+            raise InputError(
+                "exactly one of --images, --catalogue and --selection is expected: name images, a "
+                "catalogue from which they are chosen, or the folder of a selection"
+            )
         absent = [image for image in self.images if "://" not in image and not Path(image).exists()]
         if absent:
             raise InputError(

@@ -101,7 +101,8 @@ def register_together(request: JointRequest) -> tuple[list[Outcome], dict[str, A
     names = [scene_name(one.image) for one in request.files]
     if BLOCK_FOLDER in names:
         raise InputError(
-            f"{BLOCK_FOLDER}: the folder of this name holds the report on all scenes; rename the image"
+            f"{BLOCK_FOLDER}: an image has this name, but the output folder of this name contains the "
+            "report on all scenes; rename the image"
         )
     for name in (*names, BLOCK_FOLDER):
         older = older_result(request.output / name)

@@ -85,7 +85,9 @@ def _of_store(bbox: str) -> Iterator[_Answer]:
 @contextmanager
 def _of_service(server: str, token: str, box: Box) -> Iterator[_Answer]:
     if box.bounds_height:
-        raise InputError("--bbox: heights found, which no service is asked for: give W,S,E,N")
+        raise InputError(
+            "--bbox: six numbers found, but a service selects points without heights; give four: W,S,E,N"
+        )
     corners = (box.west, box.south, box.east, box.north)
     with Client(server, token) as client:
         pieces: dict[PointFormat, Callable[[], Iterator[bytes]]] = {

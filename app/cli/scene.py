@@ -69,10 +69,14 @@ class ControlOptions:
         sigmas_m = (self.reference_sigma_m, self.reference_sigma_up_m)
         if not self.reference:
             if self.dem:
-                raise InputError("--dem: it has the heights of a reference; add --reference")
+                raise InputError(
+                    "--dem: given without --reference, whose heights it contains; add --reference "
+                    "ORTHO, or leave --dem out"
+                )
             if sigmas_m != (None, None):
                 raise InputError(
-                    "--reference-sigma-m, --reference-sigma-up-m: of a reference; add --reference"
+                    "--reference-sigma-m, --reference-sigma-up-m: given without --reference, whose "
+                    "accuracy they state; add --reference ORTHO, or leave them out"
                 )
             return Control(self.block, None, marks)
         image = source_of(self.reference)

@@ -83,7 +83,10 @@ class MadeOptions:
         if self.kernel not in ("cubic", "bilinear"):
             raise InputError(f"--kernel: {self.kernel} found, cubic or bilinear expected")
         if self.anchor is not None and not self.level:
-            raise InputError(f"--anchor: {self.anchor} found without --level, which it belongs to")
+            raise InputError(
+                f"--anchor: {self.anchor} given without --level, to which it belongs; add --level, or "
+                "leave --anchor out"
+            )
         kernel: Literal["cubic", "bilinear"] = "cubic" if self.kernel == "cubic" else "bilinear"
         ortho = OrthoOptions(kernel=kernel, hide=self.hide)
         return MosaicOptions(self.level, self.anchor, self.feather_px, ortho)

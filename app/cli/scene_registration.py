@@ -117,7 +117,10 @@ def images_of(paths: Sequence[Path]) -> list[Path]:
             continue
         inside = scenes_in(path)
         if not inside:
-            raise InputError(f"{path}: no image ({', '.join(IMAGE_SUFFIXES)}) in this folder")
+            raise InputError(
+                f"{path}: the folder contains no image ({', '.join(IMAGE_SUFFIXES)}); name a folder "
+                "with images, or the images themselves"
+            )
         images.extend(inside)
     return images
 

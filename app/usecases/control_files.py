@@ -89,7 +89,10 @@ def read_control(
     of_points = [path for path in files.paths if path.is_file()]
     missing = [path for path in files.paths if not path.exists()]
     if missing:
-        raise InputError(f"{missing[0]}: no such folder of a block or file of points (--control)")
+        raise InputError(
+            f"--control: {missing[0]} does not exist; expected the folder of a block, or a file of "
+            "points"
+        )
     if not of_points and files.points != PointStatements():
         raise InputError(
             "accuracy, datum or columns of control points stated (--control-…), but no --control is a "

@@ -132,12 +132,14 @@ def _check(files: MarkedImages) -> None:
             f"--images: {len(files.images)} found, two at least expected: a position needs two views"
         )
     if files.registered is not None and files.block is not None:
-        raise InputError("one of --registered and --block is expected, not both")
+        raise InputError(
+            "--registered and --block: both given, but one of them is expected; leave one out"
+        )
     placed = files.registered or files.block
     if placed is not None and (files.sigma_m or files.rigorous or files.models != ModelChoice()):
         raise InputError(
-            "--sigma-m, --model, --crop-origin and --rigorous are for images as delivered, found with "
-            f"the models of {placed}; leave them out"
+            "--sigma-m, --model, --crop-origin and --rigorous describe delivered models, but the "
+            f"adjusted models of {placed} are used; leave these options out"
         )
 
 

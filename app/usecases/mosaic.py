@@ -278,8 +278,8 @@ def _terrain(ground: MosaicGround, read: Sequence[ReadScene]) -> Terrain:
     needing = [one for one in read if not isinstance(one.scene.scene.model, OrthoModel)]
     if needing:
         raise InputError(
-            f"{needing[0].scene.name}: its pixels lie on the map by the heights of the ground: give a "
-            "terrain or surface (--dem), or one height above the ellipsoid (--height-m)"
+            f"{needing[0].scene.name}: the image is no ortho-image, so heights of the ground are "
+            "needed; give a terrain or surface (--dem), or one height above the ellipsoid (--height-m)"
         )
     return flat_terrain(0.0)
 

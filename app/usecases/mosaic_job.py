@@ -90,7 +90,9 @@ def _check(connection: Connection, caller: Token, inputs: MakeMosaic) -> None:
     if inputs.dem is not None and inputs.height_m is not None:
         raise InputError("dem, height_m: only one of both is expected")
     if inputs.dem is None and (inputs.vertical is not None or inputs.geoid is not None):
-        raise InputError("vertical, geoid: of the heights of a dem, but dem is missing; add it")
+        raise InputError(
+            "vertical, geoid: given without dem, whose heights they describe; add dem, or leave them out"
+        )
     if inputs.crs is not None:
         with naming("crs"):
             check_map_code(inputs.crs)

@@ -181,7 +181,9 @@ def reference_files(settings: Settings, reference: NewReference | ReferenceRow) 
         dem = _path_below(settings, "dem", reference.dem)
         terrain = TerrainFile(dem, reference.vertical, geoid)
     elif reference.vertical is not None or reference.geoid is not None:
-        raise InputError("vertical, geoid: of the heights of a dem, but dem is missing; add it")
+        raise InputError(
+            "vertical, geoid: given without dem, whose heights they describe; add dem, or leave them out"
+        )
     image = _path_below(settings, "image", reference.image)
     for path in (reference.image, reference.dem or ""):
         if path.lower().endswith(CATALOGUES):

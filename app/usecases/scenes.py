@@ -204,7 +204,10 @@ def side_file_name(scene: SceneRow, name: str) -> str:
     if scene.state == "removed":
         raise Conflict(f"{file_name}: the files of scene {scene.id} were removed")
     if scene.reference is not None:
-        raise Conflict(f"{file_name}: the files of scene {scene.id} lie on the server; put it there")
+        raise Conflict(
+            f"{file_name}: the files of scene {scene.id} are in a folder of the server; put this file "
+            "there"
+        )
     if not file_name.lower().endswith(SIDE_FILE_SUFFIXES):
         raise InputError(
             f"{file_name}: unexpected suffix; a file that accompanies an image has one of "

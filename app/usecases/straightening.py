@@ -145,7 +145,7 @@ def _placed(
     fitted = refined_rpc(CorrectedModel(model, affine), shape)
     if fitted.model is None:
         raise InputError(
-            "no RPC carries the model of the straightened image: the nearest is "
+            "no RPC expresses the model of the straightened image: the best-fitting RPC is "
             f"{fitted.max_error_px:.2g} px off; orthorectify the scene instead"
         )
     how = "exactly" if fitted.max_error_px == 0.0 else f"within {fitted.max_error_px:.2g} px"

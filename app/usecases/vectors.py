@@ -86,9 +86,8 @@ class CorrectedFile:
         relative, on_the_earth = self.relative_to_control_points, self.on_the_earth
         return (
             f"CorrectedFile {self.path}: {self.crs}, {self.features} features with {self.vertices} "
-            f"vertices\n"
-            f"  {relative.label}: {relative.words}\n"
-            f"  {on_the_earth.label}: {on_the_earth.words}"
+            f"vertices\n  {relative.label}: {relative.words}\n  {on_the_earth.label}: "
+            f"{on_the_earth.words}"
         )
 
 
@@ -299,7 +298,8 @@ def _map_of(vectors: VectorFile, layer: VectorLayer) -> str:
     """The reference system of vectors, which has to be one of a map."""
     if layer.crs is None:
         raise InputError(
-            f"{vectors.path}: no known coordinate reference system found, one of a map expected"
+            f"{vectors.path}: no known coordinate reference system found; state that of a map in the "
+            "file"
         )
     try:
         check_map(layer.crs)

@@ -223,7 +223,7 @@ def test_a_backup_that_is_not_as_it_was_written_is_refused_and_restores_nothing(
             problem = change(copy)
             (problem_found,) = find_problems(copy, read_manifest(copy))
             assert problem in problem_found
-            with pytest.raises(InputError, match="nothing is restored"):
+            with pytest.raises(InputError, match="so nothing was restored"):
                 restore_backup(dsn, storage, copy)
         manifest = (copy / MANIFEST).read_text()
         (copy / MANIFEST).write_text(manifest.replace('"generation": ', '"generation": 1', 1))

@@ -291,7 +291,11 @@ def test_a_scene_joins_those_of_an_earlier_job(
     new = me.upload(path)
     for wrong, status, says in (
         ({"scenes": []}, 422, "scenes: 0 given, with 2 that they join; at least one"),
-        ({"scenes": [new, scenes["east"]]}, 422, f"job {first} has registered one of them"),
+        (
+            {"scenes": [new, scenes["east"]]},
+            422,
+            f"job {first} has registered one of these scenes already",
+        ),
         ({"join": str(UUID(int=1))}, 404, f"no job {UUID(int=1)}"),
     ):
         refused = me.refusal("register-scenes", **({"scenes": [new], "join": first} | wrong))

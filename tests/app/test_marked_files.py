@@ -160,7 +160,9 @@ def test_statements_without_a_file_of_points_and_missing_paths_are_refused(tmp_p
     with ExitStack() as stack:
         with pytest.raises(InputError, match="no --control is a file of points"):
             read_control(ControlFiles((), STATED), scenes(), IMAGES, stack)
-        with pytest.raises(InputError, match="no such folder of a block or file of points"):
+        with pytest.raises(
+            InputError, match="does not exist; expected the folder of a block, or a file of points"
+        ):
             read_control(ControlFiles((tmp_path / "x",), STATED), scenes(), IMAGES, stack)
         assert read_control(ControlFiles(), scenes(), IMAGES, stack).marked == ()
 

@@ -130,7 +130,7 @@ def test_heights_come_from_a_file_below_the_folder_of_references(
         ({"gsd_m": 0}, "a length above 0 m expected"),
         ({"feather_px": 513}, "feather_px: 513 found, 0 to 512 expected"),
         ({"dem": "a.tif", "height_m": 1.0}, "dem, height_m: only one of both"),
-        ({"vertical": "EGM96"}, "dem is missing; add it"),
+        ({"vertical": "EGM96"}, "given without dem, whose heights they describe; add dem"),
         ({"crs": "EPSG:0"}, "crs:"),
         ({"bbox": [5.0, 44.0, 6.0, 43.0]}, "bbox: "),
         ({"registrations": [str(UUID(int=1))]}, "none of the jobs registered scene"),

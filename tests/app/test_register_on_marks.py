@@ -138,7 +138,10 @@ def test_several_files_are_one_set_of_marks(image):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--control-sigma-m", "3,5"], "--control-sigma-m: of --control, which is missing; add it"),
+        (
+            ["--control-sigma-m", "3,5"],
+            "--control-sigma-m: given without --control; add --control FILE, or leave this out",
+        ),
         (
             ["--control", "MARKS", "--server", "http://localhost", "--control-crs", "EPSG:32631"],
             "the file has lon and lat, degrees of WGS 84; leave --control-crs out",

@@ -122,7 +122,7 @@ def _new_folder(folder: Path) -> Iterator[Path]:
         InputError: the folder cannot be made.
     """
     if folder.exists():
-        raise Conflict(f"{folder} exists: a backup needs a new folder")
+        raise Conflict(f"{folder} exists already; a backup needs a new folder: choose another name")
     unfinished = folder.with_name(f".{folder.name}.unfinished")
     try:
         unfinished.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -42,7 +42,9 @@ def restore_backup(
     problems = find_problems(folder, manifest, part_of(progress, 0.0, 0.3))
     if problems:
         shown = "; ".join(problems[:SHOWN_PROBLEMS])
-        raise InputError(f"{folder} is not as it was written, nothing is restored: {shown}")
+        raise InputError(
+            f"{folder}: the backup differs from its manifest, so nothing was restored: {shown}"
+        )
     backup = sha256_of(folder / MANIFEST)
     is_continued = _is_begun(storage, backup)
     has_database = is_continued and _is_restored(dsn, manifest)

@@ -80,7 +80,9 @@ def _check(connection: Connection, caller: Token, inputs: MakeBase) -> None:
         if not 0.0 <= getattr(inputs, name) <= 100.0:
             raise InputError(f"{name}: {getattr(inputs, name):g} found, 0 to 100 percent expected")
     if inputs.dem is None and inputs.vertical is not None:
-        raise InputError("vertical: of the heights of a dem, but dem is missing; add it")
+        raise InputError(
+            "vertical: given without dem, whose heights it describes; add dem, or leave vertical out"
+        )
 
 
 def _run(work: Work) -> Commit:

@@ -77,8 +77,8 @@ def _check(connection: Connection, caller: Token, inputs: AssessBlock) -> None:
         inputs.vertical or inputs.geoid or inputs.exclude_heights or inputs.land_cover
     ):
         raise InputError(
-            "vertical, geoid, exclude_heights, land_cover: of the heights of a dem, but dem is missing; "
-            "add it"
+            "vertical, geoid, exclude_heights, land_cover: given without dem, whose heights they "
+            "describe; add dem, or leave them out"
         )
     for name in ("site_sigma_m", "search_m", "dem_sigma_m", "dem_frame_sigma_m"):
         value = getattr(inputs, name)

@@ -63,10 +63,12 @@ class RegisterScenes:
 
 def _check(connection: Connection, caller: Token, inputs: RegisterScenes) -> None:
     if len(set(inputs.scenes)) < len(inputs.scenes):
-        raise InputError("scenes: one is given twice, different ones expected")
+        raise InputError("scenes: the same id is given twice; give each scene once")
     before = [] if inputs.join is None else joinable_scenes(connection, caller, inputs.join)
     if set(before) & set(inputs.scenes):
-        raise InputError(f"scenes: job {inputs.join} has registered one of them; leave it out")
+        raise InputError(
+            f"scenes: job {inputs.join} has registered one of these scenes already; leave that scene out"
+        )
     count = len(inputs.scenes) + len(before)
     if not inputs.scenes or not 2 <= count <= MOST_SCENES:
         raise InputError(

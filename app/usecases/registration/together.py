@@ -179,8 +179,8 @@ class _Scenes:
                 scene = _named(scene, name)
             if scene.acquisition.image_id in taken:
                 self.failed[name] = InputError(
-                    f"{name}: the scenes that it joins have one of this name already; leave it out, or "
-                    "rename the image if it is another one"
+                    f"{name}: the earlier run (--join) has a scene of this name already; leave this "
+                    "image out, or rename it if it is another image"
                 )
                 continue
             scene = self.attempts[name].with_scene(scene)
