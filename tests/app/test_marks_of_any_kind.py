@@ -110,7 +110,7 @@ def test_images_of_a_block_have_its_models_and_its_frame(
     added = np.array([p.on_the_earth_covariance_m2 for p in result.points])
     added -= np.array([p.covariance_m2 for p in result.points])
     np.testing.assert_allclose(np.sqrt(np.diagonal(added, 0, 1, 2)), [[1.0, 1.0, 2.0]] * 6, rtol=1e-6)
-    with pytest.raises(InputError, match="are for images as delivered"):
+    with pytest.raises(InputError, match="describe delivered models"):
         intersect_files(replace(files, sigma_m=("3",)))
 
 

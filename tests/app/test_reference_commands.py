@@ -97,7 +97,10 @@ def test_a_reference_is_added_listed_and_removed(amers: Amers, folder: Path):
         (("land.tif", "--name", " "), "1 to 120 characters"),
         (("land.tif", "--name", "x", "--dem", "heights.tif"), "heights.tif"),
         (("land.json", "--name", "x"), "a catalogue leads to files elsewhere"),
-        (("land.tif", "--name", "x", "--vertical", "ellipsoid"), "of the heights of a dem"),
+        (
+            ("land.tif", "--name", "x", "--vertical", "ellipsoid"),
+            "given without dem, whose heights they describe",
+        ),
         (("land.tif", "--name", "x", "--dem", "../beside/land.tif"), "not a file below the folder"),
     ],
 )

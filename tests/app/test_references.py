@@ -133,7 +133,7 @@ def test_only_files_of_the_folder_that_lie_on_a_map_become_references(
     refused("name: 1 to 120 characters", name=" ")
     refused("sigma_m: 0 found", sigma_m=0.0)
     refused("sigma_up_m: -1 found", sigma_up_m=-1.0)
-    refused("of the heights of a dem", vertical="EGM96")
+    refused("given without dem, whose heights they describe", vertical="EGM96")
     closed = settings.model_copy(update={"reference_folder": None})
     with pytest.raises(InputError, match="AMERS_REFERENCE_FOLDER is not set"):
         add_reference(connection, closed, NewReference("land", "reference.tif"))
