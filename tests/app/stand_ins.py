@@ -74,7 +74,15 @@ class Anything(MagicMock):
 
 
 class _AnyText(str):
-    """A text that does for a number, a list or a mapping of anything."""
+    """A text that does for a number, a list or a mapping of anything.
+
+    Attributes:
+        asked: told the name of a member that may be missing, and what stands for it.
+    """
+
+    asked: ClassVar[Callable[[str, Mapping[int | str, Any]], None]] = staticmethod(
+        lambda _name, _arguments: None
+    )
 
     def __format__(self, _spec: str) -> str:
         return str(self)
@@ -91,7 +99,7 @@ class _AnyText(str):
         """A member; what stands for none, where one is given: then that it was asked for is told."""
         if default is None:
             return self[key]
-        Anything.called(f"{self}.get", {0: key, 1: default})
+        self.asked(f"{self}.get", {0: key, 1: default})
         return default
 
     def __iter__(self) -> Iterator[Any]:

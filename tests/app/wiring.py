@@ -30,7 +30,7 @@ from amers.app.cli.supervisor import Supervisor
 from amers.app.client import Client
 from amers.app.request_context import Origin
 from tests.app.recorders import Recorders
-from tests.app.stand_ins import Anything, least_results
+from tests.app.stand_ins import Anything, _AnyText, least_results
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "wiring.json"
 PACKAGE = "amers.app.cli."
@@ -192,6 +192,7 @@ def run(words: list[str], folder: Path) -> list[tuple[str, str]]:
         monkeypatch.chdir(folder / "empty")
         recorders = Recorders(monkeypatch, PACKAGE)
         _record_service(recorders, monkeypatch)
+        monkeypatch.setattr(_AnyText, "asked", staticmethod(recorders.note))
         with contextlib.suppress(Exception):
             result = CliRunner().invoke(app, words)
             recorders.notes += [(SHOWN, line.rstrip()) for line in result.stdout.splitlines()]
