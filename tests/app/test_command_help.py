@@ -135,7 +135,7 @@ def test_figures_of_one_scene_have_axes_and_units_and_no_exit_status(
     shown = capsys.readouterr().out
     assert "exit" not in shown
     assert re.search(r"^shift in line, sample \(px\) +-22\.560, -43\.170$", shown, re.MULTILINE)
-    assert re.search(r"^shift on the ground \(m\) +48\.700$", shown, re.MULTILINE)
+    assert re.search(r"^shift on the ground \(m\) +48\.7$", shown, re.MULTILINE)
     assert re.search(r"^residual in the image, rms \(px\) ", shown, re.MULTILINE)
     show_outcome(outcome, as_json=True)
     assert '"exit_status": 0' in capsys.readouterr().out
