@@ -22,8 +22,8 @@ COMMANDS: Tree = {
             ),
             "prioritise": Command(
                 "block_state:prioritise",
-                "Set which of overlapping blocks is served: points of the block with the greater "
-                "priority.",
+                "Set the priority of a block: where blocks overlap, the block with the higher "
+                "one is served.",
             ),
             "withdraw": Command(
                 "block_state:withdraw", "Withdraw a published block; it can be restored."
@@ -43,8 +43,8 @@ COMMANDS: Tree = {
             ),
             "renew": Command(
                 "block_renewal:renew",
-                "Stage a version of a block with views of registered scenes and new points, without "
-                "vanished ones.",
+                "Stage a new version of a block: add views of registered scenes and points, "
+                "remove vanished points.",
             ),
             "frame": Command(
                 "block_frame:frame",
@@ -62,8 +62,8 @@ COMMANDS: Tree = {
             ),
             "update": Command(
                 "base:update",
-                "Make the next version of a base: new dates become views, vanished points leave, gaps "
-                "fill.",
+                "Make the next version of a base: add views of new dates, remove vanished "
+                "points, fill gaps.",
             ),
         },
     ),
@@ -90,8 +90,7 @@ COMMANDS: Tree = {
             ),
             "suspensions": Command(
                 "points:suspensions",
-                "List the points proposed for suspension because they fail in many scenes, the worst "
-                "first.",
+                "List points proposed for suspension because many scenes do not find them, worst first.",
             ),
             "suspend": Command(
                 "points:suspend",
@@ -122,8 +121,8 @@ COMMANDS: Tree = {
             ),
             "straighten": Command(
                 "scene_straighten:straighten",
-                "Resample a registered scene whose lines or samples moved, so that an RPC carries its "
-                "model.",
+                "Resample a registered scene with displaced lines or samples, so that an RPC "
+                "fits its model.",
             ),
             "mosaic": Command(
                 "scene_mosaic:mosaic",
@@ -158,8 +157,7 @@ COMMANDS: Tree = {
             ),
             "correct": Command(
                 "vectors:correct",
-                "Bring vectors that were digitised on a raw scene onto the map, with their predicted "
-                "accuracy.",
+                "Transform vectors drawn on a raw scene to the map, with their predicted accuracy.",
             ),
             "project": Command(
                 "vectors:project",
@@ -196,8 +194,8 @@ COMMANDS: Tree = {
             ),
             "points": Command(
                 "production_points:points",
-                "Make a block of the points of another base, with its own chips or from images that "
-                "show them.",
+                "Make a block from the points of another base, with chips of that base or from "
+                "your images.",
             ),
             "ortho": Command(
                 "production_ortho:ortho",
@@ -236,8 +234,7 @@ COMMANDS: Tree = {
         {
             "adopt": Command(
                 "store:adopt",
-                "Let the storage belong to the database, after you have checked that they belong "
-                "together.",
+                "Bind the storage to the database, after you have checked that they belong together.",
             ),
             "usage": Command(
                 "store:show_usage",
@@ -245,13 +242,12 @@ COMMANDS: Tree = {
             ),
             "sweep": Command(
                 "store:sweep",
-                "Move all files that no row of the database knows into the trash, however many they "
-                "are.",
+                "Move all files that no row of the database names into the trash, without a limit.",
             ),
             "verify": Command(
                 "store:verify",
-                "Read every file and report what is rotten, missing or not known; exit code 1 if "
-                "anything is.",
+                "Read every file and report rotten, missing and unknown files; exit code 1 if "
+                "there are any.",
             ),
             "trash": Group(
                 "Files that the sweep removed.",

@@ -94,5 +94,5 @@ def test_a_service_that_does_not_answer_is_named_with_what_to_do(run):
 
 
 def test_heights_are_refused_where_a_service_is_asked(run, served):
-    with pytest.raises(InputError, match="give W,S,E,N"):
+    with pytest.raises(InputError, match="give four: W,S,E,N"):
         run("--bbox", "5,43,0,6,44,100", "--server", served.url)
