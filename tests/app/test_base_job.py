@@ -49,7 +49,7 @@ def test_an_administrator_makes_and_publishes_a_base(
         ({"dates": 1}, "dates: 1 found, 2 to 50"),
         ({"max_cloud": 120.0}, "max_cloud: 120 found"),
         ({"archive": "quickbird"}, "archive"),
-        ({"vertical": "EGM96"}, "dem is missing"),
+        ({"vertical": "EGM96"}, "vertical: given without dem"),
     ],
 )
 def test_what_cannot_be_made_is_refused_when_it_is_requested(
