@@ -161,5 +161,5 @@ def _published(published: Published) -> PublishedBlock:
 def _visible_block(connection: Connection, reference: str, caller: Token | None) -> Block:
     """The block that a caller may see: any for an administrator, a published one for others."""
     if is_administrator(caller):
-        return lifecycle.find_block(connection, reference)
+        return lifecycle.find_shown_block(connection, reference)
     return lifecycle.find_published(connection, reference)

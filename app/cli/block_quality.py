@@ -180,7 +180,7 @@ def _show_report(report: BlockQualityReport, output: Path | None, *, as_json: bo
 def _show_kept(reference: str, *, as_json: bool) -> None:
     """Show the figures of a stored block that were computed when it was ingested."""
     with transaction() as connection:
-        report = lifecycle.block_report(connection, lifecycle.find_block(connection, reference))
+        report = lifecycle.block_report(connection, lifecycle.find_shown_block(connection, reference))
     if as_json:
         accuracy = [vars(figure) for figure in report.accuracy]
         stated = accuracy_document(report.stated)

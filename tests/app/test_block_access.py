@@ -202,6 +202,8 @@ def test_the_whole_life_runs_from_the_command_line(run, tmp_path):
         ("1", "withdrawn"),
         ("2", "published"),
     }
+    assert run("block", "show", "calanques")["version"] == "2"
+    assert run("block", "quality", "calanques")["points"] == 5
     assert run("block", "withdraw", "calanques@2")["state"] == "withdrawn"
 
 

@@ -95,6 +95,17 @@ def test_an_id_of_several_versions_must_be_made_precise(connection, storage, tmp
         lifecycle.find_block(connection, "calanques@3")
 
 
+def test_an_id_of_several_versions_shows_the_published_one(connection, storage, tmp_path, ingested):
+    for version in ("2", "3"):
+        folder = make_block(tmp_path / version, seed=int(version), version=version).folder
+        lifecycle.ingest_block(connection, storage, folder)
+    with pytest.raises(Conflict, match="calanques@1, calanques@2, calanques@3"):
+        lifecycle.find_shown_block(connection, "calanques")
+    lifecycle.publish_block(connection, "calanques@2")
+    assert lifecycle.find_shown_block(connection, "calanques").version == "2"
+    assert lifecycle.find_shown_block(connection, "calanques@3").version == "3"
+
+
 def test_the_store_gives_back_the_points_of_the_block(connection, storage, ingested):
     made, result = ingested
     lifecycle.publish_block(connection, "calanques")

@@ -14,6 +14,7 @@ from amers.app.db.ingestion import StoredChipFile, load_contents
 from amers.app.errors import Conflict, InputError
 from amers.app.storage import Storage, StoredFile
 from amers.app.usecases.blocks.lookup import find_block as find_block
+from amers.app.usecases.blocks.lookup import find_shown_block as find_shown_block
 from amers.app.usecases.blocks.publication import Published as Published
 from amers.app.usecases.blocks.publication import check_priority
 from amers.app.usecases.blocks.publication import find_published as find_published

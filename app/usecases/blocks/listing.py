@@ -20,7 +20,7 @@ def list_blocks(connection: DriverConnection) -> list[tuple[BlockSummary, Accura
 
 
 def listed_block(connection: DriverConnection, reference: str) -> ListedBlock:
-    """The block with this number, ID or ID@VERSION.
+    """The block with this number, ID or ID@VERSION; of several versions the published one.
 
     Raises:
         NotFound, Conflict: as `only_block`.
@@ -31,12 +31,17 @@ def listed_block(connection: DriverConnection, reference: str) -> ListedBlock:
         for number, entry in sorted(entries.items())
     }
     matches = [entries[number].block for number in names if reference in names[number]]
-    return entries[only_block(matches, reference).number]
+    return entries[only_block(published_first(matches), reference).number]
 
 
 def stated_accuracy(entry: ListedBlock) -> AccuracyStatement:
     """The accuracy of the median point of a block."""
     return median_accuracy(entry.sigma_horizontal_m, entry.sigma_up_m, entry.frame)
+
+
+def published_first(matches: Sequence[Summary]) -> Sequence[Summary]:
+    """The published version of several versions of one block; all of them where none is published."""
+    return [block for block in matches if block.state == "published"] or matches
 
 
 def only_block(matches: Sequence[Summary], reference: str) -> Summary:

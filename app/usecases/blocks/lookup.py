@@ -3,7 +3,7 @@
 from amers.app.db import blocks
 from amers.app.db.blocks import Block
 from amers.app.db.engine import Connection
-from amers.app.usecases.blocks.listing import extent_of, only_block
+from amers.app.usecases.blocks.listing import extent_of, only_block, published_first
 
 
 def find_block(connection: Connection, reference: str) -> Block:
@@ -13,6 +13,15 @@ def find_block(connection: Connection, reference: str) -> Block:
         NotFound, Conflict: as `only_block`.
     """
     return only_block(blocks.find_blocks(connection, reference), reference)
+
+
+def find_shown_block(connection: Connection, reference: str) -> Block:
+    """The block to show for a number, ID or ID@VERSION; of several versions the published one.
+
+    Raises:
+        NotFound, Conflict: as `only_block`.
+    """
+    return only_block(published_first(blocks.find_blocks(connection, reference)), reference)
 
 
 def block_extent(block: Block) -> tuple[float, float, float, float]:

@@ -72,7 +72,7 @@ class AssessBlock:
 
 def _check(connection: Connection, caller: Token, inputs: AssessBlock) -> None:
     """Check the inputs but not the files, which may lie on a disk that only the worker has."""
-    lifecycle.find_block(connection, inputs.block)
+    lifecycle.find_shown_block(connection, inputs.block)
     if inputs.dem is None and (
         inputs.vertical or inputs.geoid or inputs.exclude_heights or inputs.land_cover
     ):

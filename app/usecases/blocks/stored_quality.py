@@ -49,7 +49,7 @@ def assess_stored(
         )
     progress(0.0, "reading points")
     with database.snapshot() as connection:
-        block = lifecycle.find_block(connection, reference)
+        block = lifecycle.find_shown_block(connection, reference)
         metadata = parse_block_json(blocks.find_document(connection, block.number)).metadata
         stored = points_of_block(connection, block.number).points
         points = replace(stored, surface=blocks.find_surface_heights(connection, stored.id))
