@@ -319,7 +319,7 @@ def produce_points(
     images: Sequence[FilePath],
     folder: FilePath,
     *,
-    gsds_m: tuple[float, float] = (2.0, 20.0),
+    gsds_m: tuple[float, float] | None = None,
     points: int = 300,
     sigma_m: float | None = None,
     licence: str = "proprietary",
@@ -335,8 +335,8 @@ def produce_points(
         images: two or more images, with their models inside or next to them.
         folder: folder of the block, which gets the name of the folder; it must not exist.
         gsds_m: two ground samplings of the chips, the finer one first, metres: the ground sampling of
-            the scenes to register, and one that is about ten times coarser, for models with large
-            errors. By default 2 and 20.
+            the scenes to register, and a coarser one for models with large errors. By default the
+            ground sampling of the coarsest image, and four times that.
         points: desired number of points. By default 300.
         sigma_m: accuracy of the models, one standard deviation per coordinate, metres. By default the
             accuracy that the producer states, otherwise that of the sensor, otherwise 50 m.
@@ -352,11 +352,12 @@ def produce_points(
         ComputationError: the images do not make a block.
     """
     new = Path(folder)
+    fine_m, coarse_m = gsds_m or (None, None)
     run_image_production(
         ProductionImages(tuple(map(Path, images)), sigma_m=sigma_m),
         new,
         BlockIdentity(new.name, license=licence),
-        ProductionOptions(*gsds_m, points=points),
+        ProductionOptions(fine_m, coarse_m, points=points),
         place=WorkPlace(compute=ComputeOptions(jobs)),
         progress=progress,
     )

@@ -119,7 +119,7 @@ def measure(side_px: int, surfaces: bool) -> Outcome:
         work = Work(ThreadPoolExecutor(1))
         begun = time.process_time()
         pairs = ProductionOptions.surface_pairs if surfaces else 0
-        options = ProductionOptions(spacing_m=1000.0 * KM2_A_POINT**0.5, surface_pairs=pairs)
+        options = ProductionOptions(2.0, 20.0, 1000.0 * KM2_A_POINT**0.5, surface_pairs=pairs)
         made = produce_points(scenes, options, work=work)
         taken_s = time.process_time() - begun
         file_mib = paths[0].stat().st_size / 2**20

@@ -34,6 +34,7 @@ from amers.app.usecases.registration.register import ControlSources, SceneFiles,
 from amers.services.formats.block.reader import FolderChips, read_block
 from amers.services.formats.images.raster import write_raster
 from amers.services.formats.images.scenes import read_scene
+from amers.services.production.image_production import ProductionOptions
 from amers.services.registration.on_points import register_scene
 from amers.services.simulation.view import ViewPlan, simulate_block, simulate_view
 from amers.services.simulation.world import make_world
@@ -93,7 +94,8 @@ def make_scenes(folder: Path, count: int) -> list[Path]:
         sources.append(folder / "images" / f"{view.geometry.plan.image_id}.tif")
         write_raster(sources[-1], view.pixels, view.geometry.delivered)
     identity = BlockIdentity("throughput", title="Simulated", license="CC0-1.0")
-    run_image_production(ProductionImages(tuple(sources), sigma_m=4.0), folder / "block", identity)
+    given, options = ProductionImages(tuple(sources), sigma_m=4.0), ProductionOptions(2.0, 20.0)
+    run_image_production(given, folder / "block", identity, options)
     lon, lat = (float(value) for value in world.centre_lon_lat)
     skew_px = np.array([[0.0, 0.0, SKEW_PX], [0.0, SKEW_PX, 0.0]])
     images = []

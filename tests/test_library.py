@@ -128,7 +128,9 @@ def test_defaults_are_those_of_the_science():
         return inspect.signature(getattr(amers, name)).parameters[option].default
 
     production, registration = ProductionOptions(), RegistrationOptions()
-    assert default("produce_points", "gsds_m") == production.gsds_m
+    assert (
+        default("produce_points", "gsds_m") is production.fine_gsd_m is production.coarse_gsd_m is None
+    )
     assert default("produce_points", "points") == production.points
     assert default("register", "max_points") == registration.max_points
     limit = registration.qualification.max_ce90_on_earth_m

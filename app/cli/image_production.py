@@ -27,7 +27,6 @@ from amers.services.reports.block_adjustment_pages import IMAGES_PAGE
 from amers.services.reports.text import print_text
 from amers.services.types import Progress, part_of
 
-_DEFAULT = ProductionOptions()
 _SHARE_OF_SELECTION = 0.05
 
 
@@ -120,9 +119,13 @@ def run(
     models: ModelChoice,
     output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the block.")],
     identity: BlockIdentity,
-    gsd_m: Annotated[str, typer.Option(help="Ground sampling of the chips: FINE,COARSE, metres.")] = (
-        f"{_DEFAULT.fine_gsd_m:g},{_DEFAULT.coarse_gsd_m:g}"
-    ),
+    gsd_m: Annotated[
+        str | None,
+        typer.Option(
+            help="Ground sampling of the chips: FINE,COARSE, metres; by default the ground sampling of "
+            "the images."
+        ),
+    ] = None,
     points: Points,
     control: ControlOptions,
     neighbour: Annotated[
@@ -140,7 +143,9 @@ def run(
     """Make control points with chips from two or more overlapping images."""
     images = replace(images, images=(*images.images, *(given or ())))
     images.check()
-    fine_m, coarse_m = sampling_pair(gsd_m)
+    if gsd_m is not None:
+        fine_m, coarse_m = sampling_pair(gsd_m)
+        points = replace(points, fine_gsd_m=fine_m, coarse_gsd_m=coarse_m)
     control_files = control.files(neighbour)
     files = tuple(map(file_place, images.images))
     sigma_m, sigmas_m = stated_metres("--sigma-m", images.sigma_m, files)
@@ -160,7 +165,7 @@ def run(
             ),
             output,
             identity.named_after(output),
-            replace(points, fine_gsd_m=fine_m, coarse_gsd_m=coarse_m),
+            points,
             place=WorkPlace(place.work, ComputeOptions(place.jobs, place.cluster)),
             progress=part_of(progress, _SHARE_OF_SELECTION, 1.0 - _SHARE_OF_SELECTION),
         )
@@ -178,6 +183,7 @@ def _row(production: Production, output: Path, *, as_json: bool) -> Row:
         "report": output.with_name(f"{output.name}.adjustment") / "report.html",
         "points": len(production.points),
         "views": int(production.points.views.start[-1]),
+        "chip_gsds_m": list(production.gsds_m),
         "points_without_surface": dict(production.without_surface) if as_json else words,
         "tie_points": relative.tie_points,
         "ray_residual_delivered_px": round(relative.before_px, 3),

@@ -281,7 +281,7 @@ def _metadata(
         description=f"{n_points} ground control points with chips, from {len(scenes)} images",
         outline=production.outline,
         specification=BlockSpecification(
-            gsds_m=(options.fine_gsd_m, options.coarse_gsd_m),
+            gsds_m=production.gsds_m,
             min_views=options.min_views,
             points_per_km2=points_per_km2(options.spacing_m),
         ),

@@ -73,7 +73,7 @@ def production_cost(
     spacing_m: float,
     *,
     surface_pairs: int = 10,
-    fine_gsd_m: float = 2.0,
+    fine_gsd_m: float | None = None,
 ) -> ProductionCost:
     """The cost of a block of points.
 
@@ -82,14 +82,15 @@ def production_cost(
         area_km2: ground that two of them show.
         spacing_m: of the points.
         surface_pairs: pairs of images that give the surface at a point, at most.
-        fine_gsd_m: ground sampling of the fine chips.
+        fine_gsd_m: ground sampling of the fine chips; by default that of the coarsest image.
     """
     count, shown_km2 = len(images), sum(one.size_m[0] * one.size_m[1] for one in images) / 1e6
     points = area_km2 * 1e6 / spacing_m**2
     views = shown_km2 / area_km2
     pairs_of_point = min(surface_pairs, views * (views - 1.0) / 2.0)
     pixels = [one.size_m[0] * one.size_m[1] / one.gsd_m**2 for one in images]
-    features = FeatureOptions().for_chips(max(one.gsd_m for one in images), fine_gsd_m)
+    coarsest_m = max(one.gsd_m for one in images)
+    features = FeatureOptions().for_chips(coarsest_m, fine_gsd_m or coarsest_m)
     searched = [searched_pixels(one, min(pixels), points * views / count, features) for one in pixels]
     partners = min(PARTNERS, count - 1)
     observations = points * views * _CANDIDATES

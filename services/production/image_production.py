@@ -21,6 +21,7 @@ from amers.services.matching.ground_features import FeatureOptions
 from amers.services.matching.multi_image import RefinementOptions, chip_inside
 from amers.services.matching.predict import rank_in_group
 from amers.services.production.block_residuals import ImageFit, PointFits, image_fits, point_fits
+from amers.services.production.chip_sampling import chip_samplings_m
 from amers.services.production.control import Control, MeasuredPoints, with_control
 from amers.services.production.ground_cells import GroundGrid
 from amers.services.production.ground_parts import cut_points, measure_points
@@ -55,7 +56,8 @@ class ProductionOptions:
     """How points are produced.
 
     Attributes:
-        fine_gsd_m, coarse_gsd_m: ground samplings of the chips, metres.
+        fine_gsd_m, coarse_gsd_m: ground samplings of the chips, metres; by default that of the coarsest
+            image in two digits, and four times that.
         spacing_m: side of the squares that get one point each, metres.
         points: desired number of points; --spacing-m overrides it.
         candidates: number of tie points of every square that are tried.
@@ -70,8 +72,8 @@ class ProductionOptions:
         features, block, refinement: of the stages.
     """
 
-    fine_gsd_m: float = 2.0
-    coarse_gsd_m: float = 20.0
+    fine_gsd_m: float | None = None
+    coarse_gsd_m: float | None = None
     spacing_m: float | None = None
     points: int = 300
     candidates: int = 3
@@ -84,11 +86,6 @@ class ProductionOptions:
     features: FeatureOptions = field(default_factory=FeatureOptions)
     block: BlockOptions = field(default_factory=BlockOptions)
     refinement: RefinementOptions = field(default_factory=RefinementOptions)
-
-    @property
-    def gsds_m(self) -> tuple[float, float]:
-        """Ground samplings of the chips, finest first, metres."""
-        return self.fine_gsd_m, self.coarse_gsd_m
 
 
 @dataclass(frozen=True)
@@ -120,6 +117,7 @@ class Production:
         chips: from the row of a point to its chips, (views, 101, 101) uint16; 0 is nodata.
         adjustment: of the images; the points refer to its models.
         relative_accuracy: how well the images agree.
+        gsds_m: ground samplings of fine and of coarse chips, metres.
         outline: (m, 2) lon, lat of a rectangle that contains the points, counter-clockwise, not closed.
         control: what was found of the known ground; `adjustment` tells which of it agrees.
         image_fits: how every image fits.
@@ -131,6 +129,7 @@ class Production:
 
     points: ControlPoints
     chips: Callable[[int], ChipArray]
+    gsds_m: tuple[float, float]
     adjustment: BlockAdjustment
     relative_accuracy: RelativeAccuracy
     outline: Array
@@ -167,16 +166,17 @@ def produce_points(
         work: computes the tasks and keeps their results; by default in this process, in memory.
 
     Raises:
-        InputError: fewer than two scenes, or two of the same name.
+        InputError: fewer than two scenes, two of the same name, or the samplings are wrong.
         NotEnoughPoints: the images have too little in common.
     """
     _check_scenes(scenes)
     begun = time.thread_time()
     work = work or Work()
     passes = image_passes([scene.acquisition for scene in scenes])
-    images = _Images(scenes, passes, options, control.neighbour, work)
+    gsds_m = chip_samplings_m(scenes, options.fine_gsd_m, options.coarse_gsd_m)
+    images = _Images(scenes, passes, options, gsds_m, control.neighbour, work)
     ties, flat, tied = _tied(images, control, part_of(progress, 0.0, 0.5))
-    candidates = _candidates(images.placed(tied), tied, ties, options, excluded)
+    candidates = _candidates(images, tied, ties, excluded)
     measured = _measured(images, tied, candidates, control, progress)
     progress(0.8, "adjusting the block on its chips")
     measured, adjustment = images.adjusted_with_noise(measured)
@@ -186,6 +186,7 @@ def produce_points(
     return Production(
         points,
         chips,
+        gsds_m,
         adjustment,
         _relative_accuracy(tied, adjustment, before_px=_residual_px(scenes, ties, flat)),
         box_around(points.lon_lat_h),
@@ -220,6 +221,7 @@ class _Images:
         scenes: of the block.
         of_passes: masks of images that may share errors.
         options: of the block.
+        gsds_m: ground samplings of fine and of coarse chips, metres.
         neighbour: images of an adjusted block; None without one.
         work: computes the tasks.
     """
@@ -227,6 +229,7 @@ class _Images:
     scenes: Sequence[Scene]
     of_passes: Sequence[BoolArray]
     options: ProductionOptions
+    gsds_m: tuple[float, float]
     neighbour: KnownImages | None
     work: Work
 
@@ -285,7 +288,7 @@ def _tied(
         return flat, images.adjusted(ties, flat)
 
     options, passes, work = images.options, images.of_passes, images.work
-    features = options.features.for_chips(max(map(scene_gsd_m, images.scenes)), options.fine_gsd_m)
+    features = options.features.for_chips(max(map(scene_gsd_m, images.scenes)), images.gsds_m[0])
     ties = find_tie_points(images.scenes, passes, features, work, part_of(progress, 0.0, 0.5))
     if len(ties) == 0:
         why = "tie points: the images have nothing in common"
@@ -310,14 +313,14 @@ def _measured(
     measures, saliency = measure_points(
         scenes,
         candidates,
-        options.fine_gsd_m,
+        images.gsds_m[0],
         options.refinement,
         work=work,
         progress=part_of(progress, 0.5, 0.25),
     )
     measures, known = with_control(
         scenes,
-        MeasuredPoints(candidates, tied.frames[0], options.fine_gsd_m, measures),
+        MeasuredPoints(candidates, tied.frames[0], images.gsds_m[0], measures),
         control,
         work=work,
         progress=part_of(progress, 0.75, 0.05),
@@ -350,7 +353,7 @@ def _chosen(
     """
     measures, options = measured.measures, images.options
     active = measures.take(adjustment.active & (measures.point < len(measured.saliency)))
-    whole = shows_chip(images.placed(adjustment), active, adjustment.lon_lat_h, options.fine_gsd_m)
+    whole = shows_chip(images.placed(adjustment), active, adjustment.lon_lat_h, images.gsds_m[0])
     shown = active.take(whole)
     saliency = np.append(measured.saliency, np.zeros(len(measured.known)))[: len(adjustment.lon_lat_h)]
     if excluded is not None:
@@ -393,13 +396,10 @@ def _median_px(residual: Array) -> float:
 
 
 def _candidates(
-    scenes: Sequence[Scene],
-    block: BlockAdjustment,
-    ties: Observations,
-    options: ProductionOptions,
-    excluded: GroundMask | None,
+    images: _Images, block: BlockAdjustment, ties: Observations, excluded: GroundMask | None
 ) -> Array:
     """Ground positions (n, 3) of the tie points to try, the best of every square, square by square."""
+    options, fine_m = images.options, images.gsds_m[0]
     active = ties.take(block.active)
     rays = np.bincount(active.point, minlength=len(block.lon_lat_h))
     residual = np.linalg.norm(block.residual_px[block.active], axis=1)
@@ -411,14 +411,14 @@ def _candidates(
     if excluded is not None:
         rows = rows[~excluded(block.lon_lat_h[rows, :2])]
     n_whole = np.zeros(len(rows), dtype=np.int64)
-    for scene in scenes:
-        n_whole += chip_inside(scene.model, scene.image.shape, block.lon_lat_h[rows], options.fine_gsd_m)
+    for scene in images.placed(block):
+        n_whole += chip_inside(scene.model, scene.image.shape, block.lon_lat_h[rows], fine_m)
     rows, n_whole = rows[n_whole >= options.min_views], n_whole[n_whole >= options.min_views]
     if len(rows) < options.block.min_points:
         raise NotEnoughPoints(
             len(rows),
             options.block.min_points,
-            f"tie points whose chip of {CHIP_SIZE * options.fine_gsd_m:g} m lies completely inside "
+            f"tie points whose chip of {CHIP_SIZE * fine_m:g} m lies completely inside "
             f"{options.min_views} images",
         )
     square = _squares(block.lon_lat_h[rows], options)
@@ -479,7 +479,7 @@ def _cut_out(
         scenes, places, options.surface_pairs, of_models_m2=of_models_m2, work=work, progress=search
     )
     cut = cut_points(
-        scenes, places, chosen.shown, options.gsds_m, work=work, progress=part_of(progress, 0.5, 0.5)
+        scenes, places, chosen.shown, images.gsds_m, work=work, progress=part_of(progress, 0.5, 0.5)
     )
     points = ControlPoints(
         id=np.arange(n, dtype=np.int64),

@@ -26,9 +26,6 @@ from amers.services.types import (
     no_progress,
 )
 
-_COARSE = 4.0
-"""Ground sampling of the coarse chips over the fine one, where a block has one sampling only."""
-
 
 @dataclass(frozen=True)
 class ShortGround:
@@ -175,7 +172,7 @@ def points_where_short(
     gsds_m = np.unique(block.views.gsd_m).tolist()
     options = ProductionOptions(
         fine_gsd_m=gsds_m[0],
-        coarse_gsd_m=gsds_m[-1] if len(gsds_m) > 1 else _COARSE * gsds_m[0],
+        coarse_gsd_m=gsds_m[-1] if len(gsds_m) > 1 else None,
         spacing_m=ground.spacing_m,
         min_views=max(min_views, 2),
     )

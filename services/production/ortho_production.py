@@ -14,6 +14,7 @@ from amers.services.imagery.gaps import bridged, filled
 from amers.services.imagery.scene import Scene, scene_centre, scene_gsd_m
 from amers.services.imagery.source import Window, block_means
 from amers.services.matching.multi_image import chip_inside
+from amers.services.production.chip_sampling import chip_samplings_m
 from amers.services.production.detail_points import detail_points, detail_saliency
 from amers.services.production.point_views import check_image_names, chips_of
 from amers.services.production.view_agreement import AgreedViews, agreed_views, refuse
@@ -168,7 +169,7 @@ def produce_ortho_points(
             images.
     """
     _check_scenes(scenes)
-    scene, gsds_m = scenes[0], _gsds_m(scenes, options)
+    scene, gsds_m = scenes[0], chip_samplings_m(scenes, options.fine_gsd_m, options.coarse_gsd_m)
     squares = _squares(scene, scene_gsd_m(scene), options)
     squares = [
         square
@@ -222,7 +223,7 @@ def shifts_of_scenes(
         InputError: a scene has a parallax, or two have one name.
     """
     _check_scenes(scenes)
-    gsds_m = _gsds_m(scenes, options)
+    gsds_m = chip_samplings_m(scenes, options.fine_gsd_m, options.coarse_gsd_m)
     squares = _squares(scenes[0], scene_gsd_m(scenes[0]), options)
     corners = _corners(scenes[:1], heights, squares, gsds_m[0], options, progress=no_progress)
     lon_lat_h = np.array([corner.lon_lat_h for corner in corners]).reshape(-1, 3)
@@ -249,18 +250,6 @@ class _Corner:
     square: int
     lon_lat_h: Array
     saliency: float
-
-
-def _gsds_m(scenes: Sequence[Scene], options: OrthoPointOptions) -> tuple[float, float]:
-    """Ground samplings of the chips: those of the options, or what suits the coarsest image."""
-    fine_m = options.fine_gsd_m or float(f"{max(scene_gsd_m(scene) for scene in scenes):.2g}")
-    coarse_m = options.coarse_gsd_m or 4.0 * fine_m
-    if not 0.0 < fine_m < coarse_m:
-        raise InputError(
-            f"ground samplings of {fine_m:g} and {coarse_m:g} m given: fine_gsd_m must be above 0 and "
-            "below coarse_gsd_m"
-        )
-    return fine_m, coarse_m
 
 
 def _corners(

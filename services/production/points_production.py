@@ -11,6 +11,7 @@ from amers.services.errors import InputError, NotEnoughPoints
 from amers.services.geodesy import box_around
 from amers.services.imagery.scene import Scene, scene_gsd_m, view_direction
 from amers.services.matching.multi_image import chip_inside
+from amers.services.production.chip_sampling import chip_samplings_m
 from amers.services.production.detail_points import detail_points, detail_saliency
 from amers.services.production.point_views import check_image_names, chips_of
 from amers.services.production.view_agreement import AgreedViews, agreed_views
@@ -123,7 +124,7 @@ def produce_known_points(
     """
     check_sigmas(ground)
     check_image_names(scenes)
-    gsds_m = _gsds_m(scenes, options)
+    gsds_m = chip_samplings_m(scenes, options.fine_gsd_m, options.coarse_gsd_m)
     reason = reasons_of_places(ground, "")
     rows = np.flatnonzero(reason == "")
     at = ground.lon_lat_h[rows]
@@ -198,17 +199,6 @@ def check_sigmas(ground: GroundPoints) -> None:
             f"no sigma {', '.join(axes)}: state it (--point-sigma-m HORIZONTAL,UP); for an ASP file, "
             "state the axes of its sigmas (--sigma-axes) where you know them"
         )
-
-
-def _gsds_m(scenes: Sequence[Scene], options: KnownPointOptions) -> tuple[float, float]:
-    fine_m = options.fine_gsd_m or float(f"{max(scene_gsd_m(scene) for scene in scenes):.2g}")
-    coarse_m = options.coarse_gsd_m or 4.0 * fine_m
-    if not 0.0 < fine_m < coarse_m:
-        raise InputError(
-            f"ground samplings of {fine_m:g} and {coarse_m:g} m given: expected a fine one above 0 and "
-            "below the coarse one (--gsd-m FINE,COARSE)"
-        )
-    return fine_m, coarse_m
 
 
 def _inside(scenes: Sequence[Scene], lon_lat_h: Array, gsd_m: float) -> BoolArray:

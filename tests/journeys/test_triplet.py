@@ -90,7 +90,7 @@ def test_a_spoiled_third_view_agrees_with_the_other_two_once_registered(
 ):
     block = tmp_path / f"calanques-without-{third}"
     images = [word for name in sources for word in ("--images", triplet[name])]
-    made = amers("production", "run", *images, "--gsd-m", "0.5,2", "-o", block)
+    made = amers("production", "run", *images, "-o", block)
     assert made["points"] >= 100
     amers("block", "ingest", block, "--publish")
 

@@ -18,6 +18,7 @@ from amers.services.formats.stac.archive_items import archive_image
 from amers.services.formats.stac.catalogue import NoItems, read_catalogue
 from amers.services.geodesy import metres_per_degree
 from amers.services.imagery.archives import COPERNICUS_DEM, Archive, ArchiveImage
+from amers.services.production.chip_sampling import COARSE_FACTOR
 from amers.services.production.date_choice import TileArea, choose_dates, tile_areas
 from amers.services.types import Progress, no_progress
 
@@ -27,8 +28,6 @@ _USUAL_PX, _LEAST_PX = 100.0, 25.0
 """Sides of the square of a point: chips of neighbours touch, and overlap by three quarters."""
 _FEWEST_SQUARES = 40.0
 """A registration needs six points, and a good one twenty, of those that its scene shows."""
-COARSE_FACTOR = 4.0
-"""Ground sampling of the coarse chips over that of the fine ones."""
 SECONDS_PER_MEGABYTE = 0.4
 """Of a plan: 20 Mbit/s, a slow line of an office."""
 SECONDS_PER_POINT_AND_DATE = 0.02

@@ -11,13 +11,14 @@ from scipy.spatial import cKDTree
 
 from amers.app.errors import InputError
 from amers.app.usecases.base.request import BaseOptions, area_km2
-from amers.app.usecases.base.search import COARSE_FACTOR, spacing_m, widened
+from amers.app.usecases.base.search import spacing_m, widened
 from amers.app.usecases.base.windows import WindowReader
 from amers.services.errors import AmersError, NotEnoughPoints
 from amers.services.formats.images.scenes import read_scene
 from amers.services.geodesy import metres_per_degree
 from amers.services.imagery.archives import ArchiveImage
 from amers.services.imagery.scene import Scene
+from amers.services.production.chip_sampling import COARSE_FACTOR
 from amers.services.production.date_choice import TileArea
 from amers.services.production.date_frames import DateFrames, DateShifts, date_frames
 from amers.services.production.joined_points import TilePoints, still_found

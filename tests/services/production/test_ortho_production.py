@@ -194,5 +194,5 @@ def test_an_image_that_is_not_rectified_is_refused() -> None:
 
 def test_a_fine_sampling_above_the_coarse_one_is_refused() -> None:
     options = OrthoPointOptions(fine_gsd_m=20.0, coarse_gsd_m=10.0)
-    with pytest.raises(InputError, match="20 and 10 m given: fine_gsd_m must be above 0 and below"):
+    with pytest.raises(InputError, match="20 and 10 m given: expected a fine one above 0 and below"):
         produce_ortho_points([ortho(land())], FLAT, options)

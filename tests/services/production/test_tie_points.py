@@ -80,5 +80,6 @@ def test_a_large_image_gets_points_between_the_patches(tmp_path: Path) -> None:
     wanted = ProductionOptions(spacing_m=1500.0, surface_pairs=0)
     made = produce_points(large_scenes(tmp_path, side_px), wanted, work=work)
     assert stages(work) == {"0", "squares"}
+    assert made.gsds_m == (1.5, 6.0)
     assert len(made.points) >= 0.9 * (side_px * GSD_M / 1500.0) ** 2
     assert largest_disagreement_px(made.adjustment.models, side_px) < a_tenth_of_a_pixel
