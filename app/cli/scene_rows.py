@@ -34,7 +34,7 @@ _LABELS = {
     "visible": "points visible",
     "matched": "points matched",
     "active": "points active",
-    "held_percent": "image held by points (%)",
+    "held_percent": "image that points support (%)",
     "shift_px": "shift in line, sample (px)",
     "shift_m": "shift on the ground (m)",
     "residual_rms_px": "residual in the image, rms (px)",

@@ -30,6 +30,8 @@ const MIDDLE_PX = 0.5;
 const LABELS_PX = { left: 6, bottom: 34, top: 62 };
 /** Zoom at which a coordinate is shown, if the map is not closer and no view asks for another. */
 export const COORDINATE_ZOOM = 11;
+/** Closest zoom at which a town is shown. */
+const TOWN_ZOOM = 14;
 const PLACE_DECIMALS = 6;
 /** What the operator has chosen to lie below the map; no tiles: land only. */
 interface Background {
@@ -54,6 +56,7 @@ export class Atlas {
   private picked: ((position: Position, point?: number) => void) | null = null;
   /** Whether the reader has gone to a place: the page then does not move the map by itself. */
   went = false;
+  private fitted = false;
   coordinateZoom = COORDINATE_ZOOM;
 
   constructor(container: HTMLElement, onPoint: (id: number) => void) {
@@ -85,7 +88,7 @@ export class Atlas {
       (position) => void this.goTo(position),
       (coordinates) => {
         this.went = true;
-        this.fit({ type: "MultiPoint", coordinates });
+        this.fit({ type: "MultiPoint", coordinates }, TOWN_ZOOM);
       },
     );
     container.append(pointer, field);
@@ -136,13 +139,18 @@ export class Atlas {
     signal.addEventListener("abort", () => element.remove());
   }
 
-  /** Bring a shape into view, at the zoom `closest` at most. */
-  fit(geometry: Shape | null | undefined, closest = 14): void {
+  /**
+   * Bring a shape into view, at the zoom `closest` at most: by default where a small scene fills the map.
+   * The first one is there at once, later ones are flown to.
+   */
+  fit(geometry: Shape | null | undefined, closest = 18): void {
     const positions = geometry ? inOnePlace(positionsOf(geometry)) : [];
     if (!this.map || positions.length === 0) return;
     const box = positions.reduce((box, position) => box.extend([position[0]!, position[1]!]), new LngLatBounds());
     const padding = Math.min(60, this.map.getContainer().clientHeight / 6);
-    this.map.fitBounds(box, { padding, maxZoom: closest, animate: !matchMedia("(prefers-reduced-motion: reduce)").matches });
+    const animate = this.fitted && !matchMedia("(prefers-reduced-motion: reduce)").matches;
+    this.fitted = true;
+    this.map.fitBounds(box, { padding, maxZoom: closest, animate });
   }
 
   /** The property that colours the points; it stays for all views of the page. */

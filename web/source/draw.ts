@@ -15,7 +15,6 @@ import type { Place, ShowView } from "./view";
 const DRAWN = "drawn.geojson";
 const OF_MAP = "of_map.geojson";
 const TERRAINS = /\.(tif|tiff|jp2)$/i;
-const CLOSEST_ZOOM = 18;
 
 interface Accurate {
   name: string;
@@ -40,7 +39,7 @@ export const showDrawing: ShowView = async (place, id) => {
   document.body.append(section);
   document.body.classList.add("drawing");
   await atlas.show("vectors", []);
-  atlas.fit(scene.footprint, CLOSEST_ZOOM);
+  atlas.fit(scene.footprint);
   signal.addEventListener("abort", () => {
     section.remove();
     document.body.classList.remove("drawing");
@@ -190,7 +189,7 @@ class Drawing {
       if (this.shapes === located) this.accurate = onMap.features.map(({ properties }) => properties as Accurate);
       const features = onMap.features.map((feature): Feature => ({ ...feature, properties: { ...feature.properties, status: "active" } }));
       await this.place.atlas.show("vectors", features);
-      this.place.atlas.fit({ type: "FeatureCollection", features }, CLOSEST_ZOOM);
+      this.place.atlas.fit({ type: "FeatureCollection", features });
       this.refresh();
       announce(`${plural(features.length, "shape")} on the map.`);
       const inPixels = URL.createObjectURL(file(DRAWN, drawn));

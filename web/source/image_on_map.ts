@@ -10,7 +10,6 @@ import type { Report } from "./report_types";
 import type { PointResultProperties } from "./residuals";
 import type { Place } from "./view";
 
-const CLOSEST_ZOOM = 16;
 const SIDES: Record<Side, string> = { left: "Left of the divider", right: "Right of the divider" };
 
 /** A registration, and what the map shows of it. */
@@ -44,7 +43,7 @@ export function imageOnMap({ atlas, signal }: Place, registered: Registered): HT
       if (!comparison) throw new Error("The map cannot be shown in this browser.");
       registered.overImage(true);
       const [west, south, east, north] = mapped.bounds;
-      atlas.fit({ type: "MultiPoint", coordinates: [[west, south], [east, north]] }, CLOSEST_ZOOM);
+      atlas.fit({ type: "MultiPoint", coordinates: [[west, south], [east, north]] });
       const own = [raw, after].map((picture): Choice => ({ name: `This scene, ${picture.name.toLowerCase()}`, make: async () => picture }));
       const others = await otherPictures(job, registered.points, mapped.bounds, signal, tell);
       fill(state);

@@ -17,7 +17,6 @@ import { surfaceOnMap } from "./surface";
 import type { Place, ShowView } from "./view";
 
 const POLL_MS = 1000;
-const CLOSEST_ZOOM = 17;
 /** Scenes of a job that failed whose places are read. */
 const MOST_SCENES = 30;
 
@@ -54,7 +53,7 @@ export const showJob: ShowView = async (place, id) => {
   if (job.status === "successful") await showResults(place, job, body);
   else {
     fill(body, outcome(job), await failureReport(job, signal), nextStep(scenes));
-    place.atlas.fit(await groundOf(job, scenes, signal), CLOSEST_ZOOM);
+    place.atlas.fit(await groundOf(job, scenes, signal));
   }
 };
 
@@ -162,7 +161,7 @@ async function showRegistration(
     atlas.show("scenes", outline ? [{ type: "Feature", properties: {}, geometry: outline }] : []),
     atlas.show("vectors", [held({ type: "MultiPolygon", coordinates: areas }), ...features]),
   ]);
-  atlas.fit(outline ?? footprint, CLOSEST_ZOOM);
+  atlas.fit(outline ?? footprint);
   return {
     // The image has outlines of its own, and is not shaded.
     overImage(withPoints) {

@@ -46,7 +46,7 @@ async function start(): Promise<void> {
 async function opening(atlas: Atlas): Promise<void> {
   try {
     const { features } = await drawBlocks(atlas);
-    if (!atlas.went && /^#?\/?(points)?$/.test(location.hash)) atlas.fit({ type: "FeatureCollection", features }, 11);
+    if (!atlas.went && /^#?\/?(points)?$/.test(location.hash)) atlas.fit({ type: "FeatureCollection", features });
   } catch (error) {
     if (error instanceof Refused && error.status === 401) go("#/access");
   }

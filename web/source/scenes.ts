@@ -34,7 +34,7 @@ export const showScenes: ShowView = async (place) => {
   ]);
   const scenes = [...first.rows];
   await atlas.show("scenes", outlines(scenes));
-  if (!atlas.went) atlas.fit({ type: "FeatureCollection", features: outlines(scenes) }, CLOSEST_OF_MANY);
+  if (!atlas.went) atlas.fit({ type: "FeatureCollection", features: outlines(scenes) });
   fill(
     panel,
     h("h1", { tabindex: -1 }, "Scenes"),
@@ -58,7 +58,6 @@ export const showScenes: ShowView = async (place) => {
 };
 
 const SCENES_OF_A_PAGE = 500;
-const CLOSEST_OF_MANY = 13;
 const JOBS_OF_A_PAGE = 200;
 
 const SCENE_ORDERS: Record<string, Order<Scene>> = {

@@ -10,7 +10,6 @@ import { announce } from "./page";
 import { profileChart } from "./profile";
 import type { Place } from "./view";
 
-const CLOSEST_ZOOM = 18;
 const DECIMALS = 6;
 const FOUND = "has a height";
 
@@ -56,7 +55,7 @@ async function draw({ atlas, signal }: Place, job: string, made: Made, opacity: 
     signal,
   );
   opacity.addEventListener("input", () => fade?.(opacity.valueAsNumber / 100));
-  atlas.fit({ type: "MultiPoint", coordinates: [[west, south], [east, north]] }, CLOSEST_ZOOM);
+  atlas.fit({ type: "MultiPoint", coordinates: [[west, south], [east, north]] });
 }
 
 function legend({ height_range_m: [low, high], height_colours: colours }: Made): HTMLElement {
