@@ -31,7 +31,7 @@ RUN = {
     (
         "README.md",
         ".venv/bin/amers serve --data demo-output/store",
-    ): "tests/journeys/test_first_map.py::test_the_address_opens_the_scene_before_and_after",
+    ): "tests/journeys/test_demo.py::test_the_address_opens_the_scene_before_and_after",
     ("README.md", "gdalinfo registered/scene.tif"): f"{DEMO}::test_gdal_reads_what_the_readme_makes",
     ("docs/guide.md", "from os import environ"): f"{DEMO}::test_the_python_of_the_guide_runs_as_it_is",
     ("docs/guide.md", "import amers"): f"{DEMO}::test_the_python_of_the_guide_runs_as_it_is",

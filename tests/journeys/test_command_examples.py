@@ -55,7 +55,7 @@ db verify-backup; store verify; db restore; reference remove; base make; base up
 """All commands, each after those that make what it needs; with commas: all first examples first."""
 GROUPS = [[" ".join(name.split()) for name in group.split(",")] for group in ORDER.split(";")]
 NOT_RUN = {
-    "serve": "runs until a signal: test_first_map.py",
+    "serve": "runs until a signal: test_demo.py",
     "worker": "runs until a signal: test_worker_ending.py",
     "demo": "takes a minute: test_demo.py",
     "db restore": "needs an empty installation: test_backup.py",

@@ -114,23 +114,16 @@ def test_points_are_coloured_by_how_they_fared_in_registrations(visit, secret, s
             "not tried yet",
         ]
     )
-    look_closer(page)
+    until_drawn(page)
     assert until(lambda: pixels_drawn(page, UNTRIED) >= enough_px)
     assert pixels_drawn(page, BEST_CLASS) < enough_px
     serve_in_a_scene(service, points_of_the_block - 5)
     page.reload()
     expect(page.locator(".count")).to_have_text(f"{points_of_the_block} points")
     page.get_by_label("Points coloured by").select_option(label="health in registrations")
-    look_closer(page)
+    until_drawn(page)
     assert until(lambda: pixels_drawn(page, BEST_CLASS) >= enough_px)
     assert_readable(page, "points-by-health")
-
-
-def look_closer(page: Page) -> None:
-    """Zoom in until the points of the block lie apart."""
-    for _ in range(3):
-        until_drawn(page)
-        page.get_by_role("button", name="Zoom in").click()
 
 
 def serve_in_a_scene(service: Service, points: int) -> None:

@@ -203,7 +203,7 @@ def test_a_failed_job_leads_to_its_scene(visit, secret, world, client, tmp_path)
         with rasterio.open(noise, "w", **profile, dtype="uint8", rpcs=image.rpcs) as file:
             pixels = np.random.default_rng(5).integers(1, 255, (1, image.height, image.width))
             file.write(pixels.astype(np.uint8))
-    scene = client.post("/scenes?name=noise.tif", content=noise.read_bytes()).json()["id"]
+    scene = client.post("/scenes?name=noise.tif&sigma_m=3", content=noise.read_bytes()).json()["id"]
     asked = client.post("/processes/register-scene/execution", json={"inputs": {"scene": scene}})
     page = visit(f"#/job/{asked.json()['jobID']}", secret, WIDE)
     expect(page.locator(".badge")).to_have_text("failed")
