@@ -82,7 +82,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
         largest_incidence_deg=20.0,
     )
     images = [as_file(view, folder) for view in views]
-    options = ProductionOptions(fine_gsd_m=1.0, coarse_gsd_m=2.0, points=60)
+    options = ProductionOptions(fine_gsd_m=1.0, coarse_gsd_m=2.0, points=60, surface_pairs=0)
     delivered = ProductionImages(tuple(images), sigma_m=BLOCK_SIGMA_M)
     run_image_production(delivered, folder / "dateline", BlockIdentity("dateline"), options)
     return Made(folder / "dateline", as_file(later_view(), folder))

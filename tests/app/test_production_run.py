@@ -31,11 +31,13 @@ from amers.services.production.image_production import Production
 from amers.services.tasks import Arrays, Work
 from benchmarks.block_adjustment import large_block
 from tests.service_process import free_port
-from tests.services.simulated import BLOCK_SIGMA_M, OPTIONS, block_views, world
+from tests.services import simulated
+from tests.services.simulated import BLOCK_SIGMA_M, block_views, world
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
 SECONDS_TO_START = 60.0
+OPTIONS = replace(simulated.OPTIONS, surface_pairs=1)
 
 
 @pytest.fixture(scope="module")

@@ -53,7 +53,7 @@ def folder(real_data: Path) -> Path:
 def block(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("colour") / "ventoux"
     images = [folder / "left_image.tif", folder / "right_image.tif"]
-    options = ProductionOptions(fine_gsd_m=0.5, coarse_gsd_m=1.0)
+    options = ProductionOptions(fine_gsd_m=0.5, coarse_gsd_m=1.0, surface_pairs=0)
     run_image_production(ProductionImages(tuple(images)), made, BlockIdentity("ventoux"), options)
     return made
 

@@ -24,7 +24,7 @@ pytestmark = [pytest.mark.long, pytest.mark.real_data, pytest.mark.thorough]
 five_percent = 0.05
 the_same_point_m = 1.0
 SATURATED_SHARE = 300e-6
-OPTIONS = ProductionOptions(fine_gsd_m=0.5, coarse_gsd_m=2.0)
+OPTIONS = ProductionOptions(fine_gsd_m=0.5, coarse_gsd_m=2.0, surface_pairs=0)
 
 
 def damaged_copy(source: Path, target: Path, bits: int, share: float, seed: int) -> Path:

@@ -34,7 +34,7 @@ delivered_shift_px = 2.0
 three_tenths_of_a_pixel = 0.3
 five_kilometres = 5000.0
 far_sigma_m = 1700.0
-half_metre_chips = ProductionOptions(fine_gsd_m=0.5, coarse_gsd_m=2.0)
+half_metre_chips = ProductionOptions(fine_gsd_m=0.5, coarse_gsd_m=2.0, surface_pairs=0)
 
 
 @pytest.fixture(scope="module")

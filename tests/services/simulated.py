@@ -22,7 +22,7 @@ from amers.services.types import ChipArray, ControlPoints
 SHAPE = (700, 700)
 GSD_M = 1.0
 BLOCK_SIGMA_M = 3.0
-OPTIONS = ProductionOptions(fine_gsd_m=1.0, coarse_gsd_m=4.0, points=60)
+OPTIONS = ProductionOptions(fine_gsd_m=1.0, coarse_gsd_m=4.0, points=60, surface_pairs=0)
 
 
 @cache

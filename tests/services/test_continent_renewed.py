@@ -46,7 +46,7 @@ def judged(
 
 
 def test_new_points_are_as_precise_as_those_of_the_block(small_continent: Continent) -> None:
-    options = ProductionOptions(fine_gsd_m=2.5, coarse_gsd_m=10.0, spacing_m=SPACING_M)
+    options = ProductionOptions(fine_gsd_m=2.5, coarse_gsd_m=10.0, spacing_m=SPACING_M, surface_pairs=0)
     made = produce_points(scenes(small_continent, OF_BLOCK), options)
     chips = MemoryChips(np.concatenate([made.chips(row) for row in range(len(made.points))]))
     outline = box_around(made.points.lon_lat_h)

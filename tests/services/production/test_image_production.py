@@ -120,7 +120,12 @@ def test_every_point_has_enough_views_and_one_per_image(made: Production) -> Non
 def test_points_near_the_border_of_an_image_have_enough_views() -> None:
     # The second adjustment moves points: chips at the border of an image are then no longer whole.
     many = ProductionOptions(
-        fine_gsd_m=3.0, coarse_gsd_m=6.0, points=2000, candidates=2, min_views=len(block_views())
+        fine_gsd_m=3.0,
+        coarse_gsd_m=6.0,
+        points=2000,
+        candidates=2,
+        min_views=len(block_views()),
+        surface_pairs=0,
     )
     points = produce_points(scenes(), many).points
     counts = [

@@ -22,7 +22,7 @@ from tests.services.production.test_surface_heights import ElevationModel, read_
 
 pytestmark = [pytest.mark.long, pytest.mark.real_data]
 
-OPTIONS = ProductionOptions(fine_gsd_m=0.5, coarse_gsd_m=2.0)
+OPTIONS = ProductionOptions(fine_gsd_m=0.5, coarse_gsd_m=2.0, surface_pairs=0)
 PLEIADES_SIGMA_M = 4.0
 DSM_SIGMA_M = 1.0
 DSM_FRAME_M = (2.0, 0.3)
