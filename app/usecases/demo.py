@@ -54,7 +54,7 @@ _SCENE_ERROR_M = (40.0, -30.0)
 """Error of the scene's model, east and north."""
 _SCENE_SKEW_PX = 1.0
 """Additional error of the scene's model at the edges of the image."""
-_PRODUCTION = ProductionOptions(fine_gsd_m=2.0, coarse_gsd_m=10.0, points=250)
+_PRODUCTION = ProductionOptions(fine_gsd_m=2.0, coarse_gsd_m=10.0, points=250, surface_pairs=1)
 
 
 @dataclass(frozen=True)
