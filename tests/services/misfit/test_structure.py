@@ -146,3 +146,24 @@ def test_a_structure_of_a_chance_of_a_hundredth_is_as_likely_real_as_the_prior_l
     assert probability_of_structure(0.01, 0.05) == pytest.approx(7.99 / (7.99 + 19.0), rel=1e-3)
     assert probability_of_structure(0.01, 0.5) == pytest.approx(7.99 / 8.99, rel=1e-3)
     assert probability_of_structure(0.5) == 0.0
+
+
+@pytest.mark.parametrize(("times", "left"), [(0.5, 0.0), (4.0, 0.0), (-2.0, -2.0)])
+def test_residuals_that_errors_of_heights_explain_are_no_structure(times: float, left: float) -> None:
+    """Points too high by their error are displaced by it; against that direction nothing explains it."""
+    told = independent(np.random.default_rng(79))
+    covariance = np.array([-30.0, 20.0])
+    slope = -covariance / told.height_m.var()
+    misfit = 1e-4 * told.misfit + times * told.height_m[:, None] * slope
+    found = structures(replace(told, height_pull=covariance, misfit=misfit), ("height",))[0]
+    np.testing.assert_allclose(found.slope_px, left * slope, atol=1e-4)
+
+
+def test_errors_of_heights_explain_no_more_than_points_can_be_worse_than_declared() -> None:
+    told = independent(np.random.default_rng(79))
+    covariance = np.array([-30.0, 20.0])
+    slope = -covariance / told.height_m.var()
+    misfit = 1e-4 * told.misfit + 30.0 * told.height_m[:, None] * slope
+    found = structures(replace(told, height_pull=covariance, misfit=misfit), ("height",))[0]
+    assert (0.5 * 30.0 * np.abs(slope) < np.abs(found.slope_px)).all()
+    assert (np.abs(found.slope_px) < 25.0 * np.abs(slope)).all()
