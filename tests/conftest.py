@@ -113,17 +113,13 @@ def _slow_because(item: pytest.Item) -> str | None:
 
 
 def _begin_long_ones_first(items: list[pytest.Item]) -> None:
-    """Long modules first: one that is begun last leaves the other cores without work.
+    """Modules with long tests first: one that is begun last leaves the other cores without work.
 
     Of these, those of the science come before those of services whose workers are killed while they
     work: these find the kernels compiled.
     """
-    items.sort(
-        key=lambda item: (
-            not any(mark.name == "long" for mark in item.getparent(pytest.Module).own_markers),
-            not item.nodeid.startswith("tests/services/"),
-        )
-    )
+    long = {item.path for item in items if item.get_closest_marker("long")}
+    items.sort(key=lambda item: (item.path not in long, not item.nodeid.startswith("tests/services/")))
 
 
 @pytest.fixture(scope="session")
