@@ -279,7 +279,7 @@ def test_a_session_lost_at_drawn_statements_ends_a_command_with_a_sentence(
             lose(installations, tmp_path, command, number, ending)
 
 
-@pytest.mark.thorough
+@pytest.mark.endurance
 @pytest.mark.parametrize("command", sorted(set(STORE_COMMANDS) - {"scene register-many"}))
 def test_a_session_lost_at_more_statements_ends_a_command_with_a_sentence(
     installations: Installations, tmp_path: Path, command: str
