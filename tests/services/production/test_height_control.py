@@ -79,6 +79,13 @@ def test_steep_ground_gives_no_heights() -> None:
         known_heights(places(), surfaces(80), PLACE_M, ground(0.6, 0.6))
 
 
+def test_three_points_on_smooth_ground_are_enough_and_two_are_not() -> None:
+    three = known_heights(places()[:3], surfaces(3), PLACE_M, ground(0.0, 0.0))
+    assert len(three) == 3
+    with pytest.raises(NotEnoughPoints):
+        known_heights(places()[:2], surfaces(2), PLACE_M, ground(0.0, 0.0))
+
+
 def test_heights_of_ortho_images_err_with_the_slope_where_image_and_model_lie_off() -> None:
     blank = ArrayImage(np.zeros((SIDE, SIDE), dtype=np.float32))
     scene = Scene(blank, OrthoModel(GRID), Acquisition("ortho"), PLACE_M)
