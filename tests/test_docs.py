@@ -74,6 +74,7 @@ def test_the_site_has_the_guide_the_methods_and_the_library(site):
     assert [page for page in pages if not (site / f"{page}.html").is_file()] == []
 
 
+@pytest.mark.thorough
 def test_the_site_shows_the_pictures_of_the_readme(site):
     page = (site / "index.html").read_text()
     pictures = re.findall(r'<img[^>]* src="([^"]+)"', page)
@@ -82,18 +83,21 @@ def test_the_site_shows_the_pictures_of_the_readme(site):
         assert 10_000 < (site / picture).stat().st_size < 200_000
 
 
+@pytest.mark.thorough
 def test_a_formula_is_mathml_and_needs_no_script(site):
     page = (site / "methods/block_adjustment.html").read_text()
     assert "<math" in page
     assert "arithmatex" not in page
 
 
+@pytest.mark.thorough
 def test_the_site_asks_nothing_of_the_network(site):
     for page in site.rglob("*.html"):
         for kind in ('src="http', 'rel="stylesheet" href="http', "fonts.googleapis"):
             assert kind not in page.read_text(), page
 
 
+@pytest.mark.thorough
 def test_a_link_to_the_code_leads_to_its_reference(site):
     page = (site / "methods/rpc.html").read_text()
     assert 'href="../library/sensors.html#amers.services.sensors.rpc"' in page

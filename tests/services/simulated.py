@@ -50,11 +50,9 @@ def block_views() -> tuple[SimulatedView, ...]:
 
 @cache
 def production_with_work() -> tuple[Production, Work]:
-    """The points produced from the three views, and what was kept on the way."""
-    work = Work()
-    return produce_points(
-        [view.as_scene(BLOCK_SIGMA_M) for view in block_views()], OPTIONS, work=work
-    ), work
+    """The points produced from the three views, with surfaces, and what was kept on the way."""
+    scenes, work = [view.as_scene(BLOCK_SIGMA_M) for view in block_views()], Work()
+    return produce_points(scenes, replace(OPTIONS, surface_pairs=10), work=work), work
 
 
 def production() -> Production:

@@ -94,16 +94,19 @@ def test_no_delivered_scene_has_a_larger_error_than_stated(hard: list, clear: li
     assert not [trial.number for trial, outcome in hard + clear if outcome.delivered and outcome.wrong]
 
 
+@pytest.mark.thorough
 def test_clear_scenes_are_delivered_and_most_are_good(clear: list) -> None:
     assert all(outcome.delivered for _, outcome in clear)
     assert sum(outcome.verdict == "good" for _, outcome in clear) > len(clear) / 2
     assert all(outcome.ce90_m < half_a_pixel_of_the_chips_m for _, outcome in clear)
 
 
+@pytest.mark.thorough
 def test_most_hard_scenes_are_delivered_too(hard: list) -> None:
     assert sum(outcome.delivered for _, outcome in hard) > SCENES / 2
 
 
+@pytest.mark.thorough
 def test_errors_agree_with_the_stated_accuracy(hard: list, clear: list) -> None:
     squares = [outcome.normalised for _, outcome in hard + clear if outcome.delivered]
     low, high = chi2.interval(0.999, FREE_ERRORS * len(squares)) / np.float64(FREE_ERRORS * len(squares))
@@ -184,6 +187,7 @@ def test_every_factor_of_a_family_is_inside_its_classes(family: str) -> None:
         assert max(values) <= edges[-1], factor
 
 
+@pytest.mark.thorough
 def test_every_scene_is_in_one_class_of_each_factor(hard: list) -> None:
     for classes in by_factor(hard, FAMILIES["ordinary"].factors).values():
         assert sum(row["scenes"] for row in classes) == len(hard)

@@ -103,6 +103,7 @@ def normalised(seed: int, suns: range) -> float:
     return float(np.nanmean(squares))
 
 
+@pytest.mark.thorough
 def test_the_hole_is_the_ground_without_points() -> None:
     whole, block, outline = older()
     ground = hole()
@@ -198,6 +199,7 @@ def test_scenes_registered_on_new_points_alone_are_as_precise_as_they_declare() 
     assert 0.4 < on_new.mean() < 1.5
 
 
+@pytest.mark.thorough
 def test_the_frame_covers_what_the_new_points_share_and_what_the_others_do() -> None:
     _, block, _ = older()
     made = filled(SEEDS[0])

@@ -73,6 +73,7 @@ def test_images_with_too_few_tie_points_are_searched_at_a_finer_sampling() -> No
     assert (np.diff(ties.point) >= 0).all()
 
 
+@pytest.mark.thorough
 @pytest.mark.long
 def test_a_large_image_gets_points_between_the_patches(tmp_path: Path) -> None:
     side_px = 8200
