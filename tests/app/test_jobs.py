@@ -170,6 +170,10 @@ def test_the_same_request_with_the_same_key_creates_one_job(
     first = client.post(EXECUTE, json=body, headers=me | keyed).json()
     again = client.post(EXECUTE, json=body, headers=me | keyed).json()
     assert again["jobID"] == first["jobID"]
+    second = me | {"Idempotency-Key": "k2"}
+    of_second = [client.post(EXECUTE, json=body, headers=second).json()["jobID"] for _ in range(2)]
+    assert len({first["jobID"], *of_second}) == 2, "each key has a job of its own"
+    assert client.post(EXECUTE, json=body, headers=me | keyed).json()["jobID"] == first["jobID"]
     other = {"inputs": {"scene": scene, "options": {"max_points": 7}}}
     assert client.post(EXECUTE, json=other, headers=me | keyed).status_code == 422
     stranger = client.post(EXECUTE, json=body, headers=bearer("admin") | keyed).json()

@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import pytest
 
 from amers.services.errors import NoConsensus
 from amers.services.imagery.source import ArrayImage, Window
 from amers.services.registration.context import SearchStage
+from amers.services.registration.far import _contrast, _standardised
 from amers.services.registration.on_points import Registration, register_scene
 from amers.services.types import ChipArray, ChipSource
 from tests.services.registration.wide_ground import CENTRE, true_model, wide_points, wide_scene
@@ -103,3 +105,11 @@ def test_a_crop_of_other_ground_is_refused_with_how_far_was_searched() -> None:
         register_scene(wide_scene(*CROP, (0.0, 0.0), seed=1), points, chips)
     assert "inf" not in str(refused.value)
     assert "nan" not in str(refused.value)
+
+
+def test_contrast_makes_covariances_normalised_correlations() -> None:
+    rng = np.random.default_rng(17)
+    pixels = (100.0 + 20.0 * rng.normal(size=(60, 60))).astype(np.float32)
+    chip = rng.normal(size=(11, 11)).astype(np.float32)
+    found = cv2.matchTemplate(pixels, _standardised(chip), cv2.TM_CCORR) / _contrast(pixels, 11)
+    np.testing.assert_allclose(found, cv2.matchTemplate(pixels, chip, cv2.TM_CCOEFF_NORMED), atol=1e-4)
