@@ -55,8 +55,11 @@ def amers(*words: str | Path) -> Done:
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> dict:
-    words = ("demo", "-o", tmp_path_factory.mktemp("demo") / "demo-output", "--json")
+def demo(open_folder: Path) -> dict:
+    folder = open_folder / uuid4().hex[:8]
+    folder.mkdir()
+    folder.chmod(0o755)
+    words = ("demo", "-o", folder / "demo-output", "--json")
     result = amers_process(words, os.environ)
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)
