@@ -1,4 +1,4 @@
-"""Ground samplings of the chips of a block: those that are given, or those of its images."""
+"""Ground samplings of the chips of a block, from the options or from the images."""
 
 from collections.abc import Sequence
 
