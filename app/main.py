@@ -146,8 +146,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(ReplyHeaders, settings=settings)
     error_responses.install(app)
     openapi.install(app, ROUTERS, settings)
-    for router in ROUTERS:
-        app.include_router(router)
+    # As they are: included, they would be built anew for each application, at its first request.
+    app.router.routes.extend(route for router in ROUTERS for route in router.routes)
     return app
 
 
