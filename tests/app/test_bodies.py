@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, MutableMapping
+from itertools import product
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -126,10 +127,12 @@ def test_nobody_without_a_token_gets_more_than_a_small_body_read(app: FastAPI) -
             assert Sender().request(app, method, path, (b"tus-resumable", b"1.0.0")).status == 401
 
 
-@pytest.mark.parametrize("path", LIKE_UPLOADS)
-@pytest.mark.parametrize("method", ["POST", "PUT", "PATCH", "DELETE", "GET", "HEAD", "OPTIONS"])
-def test_a_path_like_that_of_an_upload_is_none(app: FastAPI, method: str, path: str) -> None:
-    assert Sender().request(app, method, path, JSON).read_bytes <= ANONYMOUS_BODY_BYTES + len(PIECE)
+def test_a_path_like_that_of_an_upload_is_none(app: FastAPI) -> None:
+    for method, path in product(
+        ("POST", "PUT", "PATCH", "DELETE", "GET", "HEAD", "OPTIONS"), LIKE_UPLOADS
+    ):
+        sender = Sender().request(app, method, path, JSON)
+        assert sender.read_bytes <= ANONYMOUS_BODY_BYTES + len(PIECE), (method, path)
 
 
 def test_a_body_is_not_read_before_its_sender_may_send_it(app: FastAPI, bearer) -> None:
