@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import cycle
 
 import cv2
 import numpy as np
@@ -33,6 +34,9 @@ from tests.services.imagery.textures import (
 
 DTYPES = ("uint8", "uint16", "float32")
 PLACES = (0.1, 0.5, 0.9)
+STORED = tuple(zip(TEXTURES, cycle(DTYPES)))
+"""Textures as they are stored: each in one way, each way twice."""
+STRUCTURED = tuple(one for one in STORED if one[0] != "speckle")
 
 
 def found(pixels: FloatImage) -> list[PixelFinding]:
@@ -43,8 +47,7 @@ def kinds(pixels: FloatImage) -> list[Fault]:
     return [one.kind for one in found(pixels)]
 
 
-@pytest.mark.parametrize("name", TEXTURES)
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("name", "dtype"), STORED)
 def test_repeated_lines_are_named_with_their_lines(name: str, dtype: str) -> None:
     pixels = texture(name, 1)
     for place in PLACES:
@@ -70,8 +73,7 @@ def test_a_line_that_is_sent_again_and_again_is_one_finding() -> None:
     assert (one.kind, one.line, one.lines) == (Fault.REPEATED_LINES, 201, 11)
 
 
-@pytest.mark.parametrize("name", [name for name in TEXTURES if name != "speckle"])
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("name", "dtype"), STRUCTURED)
 def test_lost_lines_are_named_between_their_neighbours(name: str, dtype: str) -> None:
     for place in (0.02, *PLACES):
         for count in (5, 30):
@@ -86,8 +88,7 @@ def test_lines_repeated_before_a_compression_are_named_as_repeated() -> None:
     assert (one.kind, one.amount_px) == (Fault.REPEATED_LINES, 24.0)
 
 
-@pytest.mark.parametrize("name", [name for name in TEXTURES if name != "speckle"])
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("name", "dtype"), STRUCTURED)
 def test_odd_lines_and_samples_aside_are_measured(name: str, dtype: str) -> None:
     for apart in (0.3, -1.0, 12.0):
         (one,) = found(rounded(interlaced(texture(name, 6), apart), dtype))
@@ -105,8 +106,7 @@ def test_a_second_image_is_measured(name: str) -> None:
         assert one.amount_px == pytest.approx(np.hypot(line, sample), abs=0.01)
 
 
-@pytest.mark.parametrize("name", ["fractal", "rough", "blurred", "fields"])
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("name", "dtype"), STRUCTURED[:4])
 def test_a_part_of_another_image_is_named_at_a_corner(name: str, dtype: str) -> None:
     for corner in ((64, 48), (256, 208)):
         for apart in (5, 20):
