@@ -81,10 +81,10 @@ def test_two_marks_and_ties_place_a_scene_beside_one_with_six(
     assert (only["id"], only["version"], only["active"]) == ("marks.csv", "marks", None)
 
 
-def test_check_points_are_reported_with_their_scene(
+def test_check_points_are_reported_with_their_scene_and_a_wrong_mark_is_rejected_by_name(
     world: FlatWorld, images: list[Path], tmp_path: Path
 ) -> None:
-    marks = write_marks(tmp_path / "marks.csv", world, {"east": 6, "south": 5})
+    marks = write_marks(tmp_path / "marks.csv", world, {"east": 6, "south": 6}, wrong="south")
     origin, head, *rows = marks.read_text().splitlines()
     held_out = [f"{row},{int(row.startswith(('GCP3,', 'GCP4,')))}" for row in rows]
     marks.write_text("\n".join([origin, f"{head},check", *held_out]))
@@ -96,6 +96,8 @@ def test_check_points_are_reported_with_their_scene(
         assert check["against"] == "independent check points of marks.csv"
         assert check["accuracy"]["n"] == 2
         assert not {"GCP3", "GCP4"} & set(statuses(tmp_path / "out", image.stem))
+    assert statuses(tmp_path / "out", "south")["GCP1"] == "rejected"
+    assert max(errors_px(images, tmp_path / "out", world)) < 2.0 * A_FIFTH_OF_A_PIXEL
 
 
 def test_a_scene_without_marks_says_what_ties_leave_open(
@@ -120,14 +122,6 @@ def test_marks_are_added_to_the_points_of_a_base(
     assert ended.returncode == 0, ended.stderr
     assert max(errors_px(images, tmp_path / "out", world)) < A_FIFTH_OF_A_PIXEL
     assert statuses(tmp_path / "out", "south") == {f"GCP{k}": "used" for k in range(5)}
-
-
-def test_a_wrong_mark_is_rejected_by_name(world: FlatWorld, images: list[Path], tmp_path: Path) -> None:
-    marks = write_marks(tmp_path / "marks.csv", world, {"east": 6, "south": 6}, wrong="south")
-    ended = register(images, tmp_path / "out", "--control", marks)
-    assert ended.returncode == 0, ended.stderr
-    assert statuses(tmp_path / "out", "south")["GCP1"] == "rejected"
-    assert max(errors_px(images, tmp_path / "out", world)) < 2.0 * A_FIFTH_OF_A_PIXEL
 
 
 def test_marks_of_other_images_are_refused(world: FlatWorld, images: list[Path], tmp_path: Path) -> None:
