@@ -117,21 +117,21 @@ def test_a_footprint_finds_the_points_of_both_sides(made: Made, published: None,
     assert (found.lon_lat_h[:, 0] < 0.0).any()
 
 
-@pytest.mark.parametrize(
-    ("box", "sides"),
-    [("179.9,-17.1,-179.9,-16.9", 2), ("179.9,-17.1,180,-16.9", 1), ("-180,-17.1,-179.9,-16.9", 1)],
-    ids=["both sides", "east of Asia", "west of America"],
-)
 def test_boxes_find_what_lies_on_their_side(
-    made: Made, published: None, client: TestClient, bearer, box: str, sides: int
+    made: Made, published: None, client: TestClient, bearer
 ) -> None:
     lon = check_block(made.block).points.lon_lat_h[:, 0]
-    asked = f"items?bbox={box}&limit=1000"
-    points = client.get(f"/collections/points/{asked}", headers=bearer("read")).json()
-    expected = len(lon) if sides == 2 else int(((lon > 0.0) == box.endswith(",180,-16.9")).sum())
-    assert points["numberReturned"] == expected
-    blocks = client.get(f"/collections/blocks/{asked}", headers=bearer("admin")).json()
-    assert blocks["numberReturned"] == 1
+    for box, sides in [
+        ("179.9,-17.1,-179.9,-16.9", 2),
+        ("179.9,-17.1,180,-16.9", 1),
+        ("-180,-17.1,-179.9,-16.9", 1),
+    ]:
+        asked = f"items?bbox={box}&limit=1000"
+        points = client.get(f"/collections/points/{asked}", headers=bearer("read")).json()
+        expected = len(lon) if sides == 2 else int(((lon > 0.0) == box.endswith(",180,-16.9")).sum())
+        assert points["numberReturned"] == expected, box
+        blocks = client.get(f"/collections/blocks/{asked}", headers=bearer("admin")).json()
+        assert blocks["numberReturned"] == 1, box
 
 
 def outlines_of(client: TestClient, headers: dict[str, str], how: str = "GET", **asked: Any) -> Any:

@@ -74,24 +74,26 @@ def test_tiles_and_the_map_keep_their_own_caching(client: TestClient, bearer: Be
     assert again.status_code == 304
 
 
-@pytest.mark.parametrize(
-    "host",
-    ["evil.example", "evil.example:8000", "localhost.evil.example", "169.254.169.254", "[::2]", ""],
-)
-def test_a_host_that_is_no_name_of_the_service_is_refused(client: TestClient, host: str):
-    reply = client.get("/", headers={"Host": host})
-    assert reply.status_code == 400
-    assert reply.headers["content-type"] == "application/problem+json"
-    assert "AMERS_TRUSTED_HOSTS" in reply.json()["detail"]
-    assert reply.headers["cache-control"] == "no-store"
+def test_a_host_that_is_no_name_of_the_service_is_refused(client: TestClient):
+    for host in [
+        "evil.example",
+        "evil.example:8000",
+        "localhost.evil.example",
+        "169.254.169.254",
+        "[::2]",
+        "",
+    ]:
+        reply = client.get("/", headers={"Host": host})
+        assert reply.status_code == 400, host
+        assert reply.headers["content-type"] == "application/problem+json", host
+        assert "AMERS_TRUSTED_HOSTS" in reply.json()["detail"], host
+        assert reply.headers["cache-control"] == "no-store", host
 
 
-@pytest.mark.parametrize(
-    "host", ["localhost", "LOCALHOST:80", "127.0.0.1:8000", "[::1]:8000", "testserver"]
-)
-def test_the_own_names_of_a_service_are_accepted(client: TestClient, host: str):
+def test_the_own_names_of_a_service_are_accepted(client: TestClient):
     """`testserver` is the address at which the client of the tests arrives."""
-    assert client.get("/", headers={"Host": host}).status_code == 200
+    for host in ["localhost", "LOCALHOST:80", "127.0.0.1:8000", "[::1]:8000", "testserver"]:
+        assert client.get("/", headers={"Host": host}).status_code == 200, host
 
 
 @pytest.mark.parametrize(

@@ -49,22 +49,21 @@ def closed(schema: Any) -> Any:
     return members
 
 
-@pytest.mark.parametrize(
-    ("collection", "name"),
-    [
+def test_a_page_that_the_database_makes_follows_the_schema_of_its_collection(check):
+    for collection, name in [
         ("points", "PointPage"),
         ("blocks", "BlockPage"),
         ("density", "DensityPage"),
         ("point-history", "PointHistoryPage"),
-    ],
-)
-def test_a_page_that_the_database_makes_follows_the_schema_of_its_collection(check, collection, name):
-    page = check(f"/collections/{collection}/items", name)
-    assert page["features"]
-    streamed = check(f"/collections/{collection}/items?limit=10000", name)
-    assert streamed["features"] == page["features"]
-    feature = check(f"/collections/{collection}/items/{page['features'][0]['id']}", feature_model(name))
-    assert feature["id"] == page["features"][0]["id"]
+    ]:
+        page = check(f"/collections/{collection}/items", name)
+        assert page["features"], collection
+        streamed = check(f"/collections/{collection}/items?limit=10000", name)
+        assert streamed["features"] == page["features"], collection
+        feature = check(
+            f"/collections/{collection}/items/{page['features'][0]['id']}", feature_model(name)
+        )
+        assert feature["id"] == page["features"][0]["id"], collection
 
 
 def feature_model(page_model: str) -> str:

@@ -116,9 +116,12 @@ def test_a_job_makes_the_surface_of_registered_scenes(
     assert bearer("read").execute("make-surface", inputs).status_code == 403
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
+def test_inputs_without_a_surface_are_refused(me: Caller, dsn: str) -> None:
+    ids = [me.scene(TIFF, f"name={name}.tif") for name in "ab"]
+    with engine.connect(dsn) as connection:
+        for scene in ids:
+            scenes.describe(connection, UUID(scene), Acquisition("a"), (300, 300), 0.5)
+    for change, said in [
         ({"scenes": []}, "scenes: 0 given"),
         ({"pairs": 0}, "pairs: 0 found, 1 to 100 expected"),
         ({"fill_cells": 21}, "fill_cells: 21 found, 0 to 20 expected"),
@@ -127,16 +130,10 @@ def test_a_job_makes_the_surface_of_registered_scenes(
         ({"gsd_m": 0.2}, "a finer map shows no more"),
         ({"registrations": [str(UUID(int=1))]}, "none of the jobs registered scene"),
         ({"block": "flat"}, "block: no such input"),
-    ],
-)
-def test_inputs_without_a_surface_are_refused(me: Caller, dsn: str, change: dict, said: str) -> None:
-    ids = [me.scene(TIFF, f"name={name}.tif") for name in "ab"]
-    with engine.connect(dsn) as connection:
-        for scene in ids:
-            scenes.describe(connection, UUID(scene), Acquisition("a"), (300, 300), 0.5)
-    refused = me.execute("make-surface", {"scenes": ids, **change})
-    assert refused.status_code == 422
-    assert said in refused.json()["detail"]
+    ]:
+        refused = me.execute("make-surface", {"scenes": ids, **change})
+        assert refused.status_code == 422, change
+        assert said in refused.json()["detail"], change
     assert me.execute("make-surface", {"scenes": [ids[0], ids[0]]}).status_code == 422
     assert me.execute("make-surface", {"scenes": [ids[0], str(uuid4())]}).status_code == 404
     assert me.execute("make-surface", {"scenes": ids}).status_code == 201

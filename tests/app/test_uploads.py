@@ -250,9 +250,8 @@ def test_an_unusable_file_is_refused_and_deleted(
     assert stored_files(storage) == []
 
 
-@pytest.mark.parametrize(
-    ("size", "metadata", "status"),
-    [
+def test_an_unusable_upload_is_refused_before_it_begins(client: TestClient, me: Caller):
+    for size, metadata, status in [
         (0, {"filename": "a.tif"}, 422),
         (10, {}, 422),
         (LIMIT_BYTES + 1, {"filename": "a.tif"}, 413),
@@ -265,14 +264,10 @@ def test_an_unusable_file_is_refused_and_deleted(
         (10, {"filename": "a.xml", "purpose": "model"}, 422),
         (10, {"filename": "a.zip", "purpose": "block"}, 403),
         (10, {"filename": "..."}, 422),
-    ],
-)
-def test_an_unusable_upload_is_refused_before_it_begins(
-    client: TestClient, me: Caller, size: int, metadata: dict[str, str], status: int
-):
-    reply = begun(client, me, size, **metadata)
-    assert reply.status_code == status, reply.text
-    assert me.get("/scenes").json()["scenes"] == []
+    ]:
+        reply = begun(client, me, size, **metadata)
+        assert reply.status_code == status, reply.text
+        assert me.get("/scenes").json()["scenes"] == [], size
 
 
 def zipped(files: dict[str, bytes]) -> bytes:
@@ -607,11 +602,9 @@ def test_a_checksum_is_compared_in_small_letters_and_in_capitals(client: TestCli
         assert whole(client, me, TIFF, filename="a.tif", sha256=digest).status_code == 204
 
 
-@pytest.mark.parametrize(("sigma_m", "status"), [("0", 422), ("-1", 422), ("inf", 422), ("0.1", 201)])
-def test_the_accuracy_of_a_model_is_a_number_of_metres_above_zero(
-    client: TestClient, me: Caller, sigma_m: str, status: int
-):
-    assert begun(client, me, 10, filename="a.tif", sigma_m=sigma_m).status_code == status
+def test_the_accuracy_of_a_model_is_a_number_of_metres_above_zero(client: TestClient, me: Caller):
+    for sigma_m, status in [("0", 422), ("-1", 422), ("inf", 422), ("0.1", 201)]:
+        assert begun(client, me, 10, filename="a.tif", sigma_m=sigma_m).status_code == status, sigma_m
 
 
 def test_a_block_is_ingested_from_a_complete_archive_of_ones_own(
