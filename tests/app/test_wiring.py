@@ -11,8 +11,6 @@ import pytest
 
 from tests.app.wiring import GOLDEN, NO_OPTIONS, commands, wiring
 
-pytestmark = pytest.mark.thorough
-
 EXPECTED = json.loads(GOLDEN.read_text())
 NOWHERE = 28
 """Options, of 439, whose way is not seen so: they need others in a way of their own, or what they are
