@@ -118,7 +118,6 @@ def ended(words: list[str], error: Exception, monkeypatch: pytest.MonkeyPatch) -
         return failure(end)[1]
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize(("error", "status"), OUTCOMES.values(), ids=OUTCOMES)
 @pytest.mark.parametrize("words", TO_TRY, ids=" ".join)
 def test_every_command_ends_with_the_status_of_what_happened(
