@@ -1,19 +1,29 @@
-"""Every reader and every statement that its files may make: used, assumed, named or refused."""
+"""Every reader and every statement that its files may make: used, assumed, named or refused.
+
+`tests/golden/all_readings.json` has what else is read of these files. After a change that is meant,
+write it anew (`python -m tests.services.formats.test_statement_matrix`) and read what differs.
+"""
 
 import ast
 import importlib
+import json
 import pkgutil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
 from amers.services.formats.readers import OWN_FILES, PARTS, READERS
 from amers.services.statements import Subject
 from scripts.make_inputs_page import PAGE, inputs_page
+from tests.services.figures import READ, Figures, differing, figures
 from tests.services.formats import statements
 from tests.services.formats.statements.cell import CELLS, Cell
 
 ROOT = Path(__file__).parents[3]
+GOLDEN = ROOT / "tests/golden/all_readings.json"
+LEFT_OUT = {"statements", "line_num", "line_den", "sample_num", "sample_den"}
+"""Members that cells check: of models that are fitted, many coefficients are as good as others."""
 for module in pkgutil.iter_modules(statements.__path__):
     importlib.import_module(f"{statements.__name__}.{module.name}")
 
@@ -25,9 +35,31 @@ def reading_functions() -> set[str]:
     return {name for name in functions if name.startswith(("read_", "parse_", "open_", "load_"))}
 
 
-@pytest.mark.parametrize("cell", CELLS, ids=str)
-def test_a_statement_becomes_what_the_page_says(cell: Cell, tmp_path: Path) -> None:
-    cell.check(tmp_path)
+def keys() -> list[str]:
+    """The names of the cells among all readings: those of one name are numbered."""
+    names = [f"{cell}: {cell.shows}" for cell in CELLS]
+    return [f"{name} ({names[:n].count(name) + 1})" for n, name in enumerate(names)]
+
+
+def reading(cell: Cell, folder: Path) -> Figures:
+    """What is read of the file of a cell, which is checked, but for what is checked already."""
+    folder = folder / "files"
+    folder.mkdir()
+    words = json.dumps(figures(cell.check(folder), LEFT_OUT))
+    return dict(json.loads(words.replace(str(folder), "<folder>")))
+
+
+@pytest.fixture(scope="module")
+def expected() -> dict[str, Figures]:
+    """All that is read of each file."""
+    return dict(json.loads(GOLDEN.read_text()))
+
+
+@pytest.mark.parametrize(("cell", "key"), zip(CELLS, keys(), strict=True), ids=map(str, CELLS))
+def test_a_statement_becomes_what_the_page_says_and_all_else_is_read_as_it_was(
+    cell: Cell, key: str, expected: dict[str, Figures], tmp_path: Path
+) -> None:
+    assert not differing(reading(cell, tmp_path), expected.get(key, {}), READ)
 
 
 def test_every_reader_has_a_row() -> None:
@@ -51,3 +83,13 @@ def test_every_line_of_the_page_has_a_file_that_shows_it() -> None:
 
 def test_the_page_is_that_of_the_readers() -> None:
     assert PAGE.read_text() == inputs_page()
+
+
+def _written(cell: Cell, key: str) -> str:
+    with TemporaryDirectory() as folder:
+        return f"{json.dumps(key)}: {json.dumps(reading(cell, Path(folder)))}"
+
+
+if __name__ == "__main__":
+    read = [one for one in zip(CELLS, keys(), strict=True) if one[0].outcome != "refused"]
+    GOLDEN.write_text("{\n" + ",\n".join(_written(*one) for one in read) + "\n}\n")

@@ -40,7 +40,16 @@ def written_item(folder: Path, change: Change) -> dict[str, Any]:
         "stac_version": "1.1.0",
         "id": "one",
         "geometry": SQUARE,
-        "properties": {"datetime": "2024-05-01T10:00:00Z", "platform": "sentinel-2a"},
+        "properties": {
+            "datetime": "2024-05-01T10:00:00Z",
+            "platform": "sentinel-2a",
+            "eo:cloud_cover": 12.5,
+            "eo:snow_cover": 3.5,
+            "view:incidence_angle": 8.0,
+            "view:azimuth": 101.0,
+            "view:sun_elevation": 41.0,
+            "view:sun_azimuth": 152.0,
+        },
         "assets": {"image": {"href": str(image), "type": "image/tiff", "roles": ["data"]}},
         "links": [],
     }

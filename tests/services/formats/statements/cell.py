@@ -38,16 +38,22 @@ class Cell:
     def __str__(self) -> str:
         return f"{self.reader}-{self.subject}-{self.outcome}-{self.read.__name__}"
 
-    def check(self, folder: Path) -> None:
-        """Write and read the file; what becomes of the statement is what the cell says."""
+    def check(self, folder: Path) -> Any:
+        """Write and read the file; what becomes of the statement is what the cell says.
+
+        Returns:
+            What is read; None of a file that is refused.
+        """
         if self.outcome == "refused":
             with pytest.raises(InputError) as refused:
                 self.read(folder)
             assert self.shows in str(refused.value)
-            return
-        stated: Statements = self.read(folder).statements
+            return None
+        read = self.read(folder)
+        stated: Statements = read.statements
         of_subject = [s for s in stated if s.subject is self.subject and s.use is _USES[self.outcome]]
         assert any(self.shows in str(s) for s in of_subject), [str(s) for s in stated]
+        return read
 
 
 def cell(reader: str, subject: Subject, outcome: Outcome, shows: str) -> Callable[[Read], Read]:

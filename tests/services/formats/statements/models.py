@@ -205,7 +205,7 @@ def isd_without_errors(folder: Path) -> Scene:
     return beside(folder, "a.XML", isd(UNKNOWN))
 
 
-@cell(ISD, Subject.IDENTITY, "used", "a.XML: identity: WV02: used")
+@cell(ISD, Subject.IDENTITY, "used", "a.XML: identity: WV02, 2024-05-01 10:20:30 UTC: used")
 def isd_of_a_satellite(folder: Path) -> Scene:
     return beside(folder, "a.XML", isd(CROP))
 
@@ -459,7 +459,7 @@ def with_world_file(folder: Path, text: str, prj: str = "", name: str = "a.tfw")
     return read_scene(write_image(folder / "a.tif"), sigma_m=5.0)
 
 
-WORLD_TEXT = "10.0\n0\n0\n-10.0\n334005.0\n5851995.0\n"
+WORLD_TEXT = "10.0\n0.5\n-0.25\n-9.0\n334005.0\n5851995.0\n"
 
 
 @cell(WORLD, Subject.PLACE, "used", "a.tfw, geotransform: place in the full image: map grid: used")

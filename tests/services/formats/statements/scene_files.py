@@ -87,7 +87,7 @@ def aux_rpc(model: RpcModel) -> str:
 
 
 def isd(model: RpcModel, shape: tuple[int, int] = SHAPE, specification: str = "RPC00B") -> str:
-    """The XML of a WorldView product with nothing but sizes and a RPB block."""
+    """The XML of a WorldView product with nothing but sizes, time, angles and a RPB block."""
     numbers = named_numbers(model)
     rows = [f"<{name.upper()}>{numbers[key]!r}</{name.upper()}>" for key, name in RPB_KEYS.items()]
     for key, name in RPB_LISTS.items():
@@ -98,7 +98,9 @@ def isd(model: RpcModel, shape: tuple[int, int] = SHAPE, specification: str = "R
     bias = numbers.get("ERR_BIAS", 0.0)
     return (
         '<?xml version="1.0" encoding="UTF-8"?>'
-        f"<isd><IMD><NUMROWS>{shape[0]}</NUMROWS><NUMCOLUMNS>{shape[1]}</NUMCOLUMNS></IMD><RPB>"
+        f"<isd><IMD><NUMROWS>{shape[0]}</NUMROWS><NUMCOLUMNS>{shape[1]}</NUMCOLUMNS>"
+        "<FIRSTLINETIME>2024-05-01T10:20:30.5Z</FIRSTLINETIME><MEANSUNEL>41.0</MEANSUNEL>"
+        "<MEANSUNAZ>152.0</MEANSUNAZ><MEANSATEL>66.0</MEANSATEL><MEANSATAZ>73.0</MEANSATAZ></IMD><RPB>"
         f"<SATID>WV02</SATID><SPECID>{specification}</SPECID><IMAGE><ERRBIAS>{bias}</ERRBIAS>"
         f"<ERRRAND>0.0</ERRRAND>{''.join(rows)}</IMAGE></RPB></isd>"
     )
