@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Collection, Iterator, Mapping
 from datetime import date
 from enum import Enum
-from zlib import crc32
 
 import numpy as np
 
@@ -16,8 +15,6 @@ nothing, change them by less."""
 _ABSOLUTE = 1e-3
 """The same of numbers that are nearly zero, in these parts of the largest beside them, or of one."""
 _DEEPEST = 7
-_LONGEST = 60
-"""Letters of a text, of which the rest is a check sum."""
 
 
 def figures(value: object, left_out: Collection[str] = ()) -> Figures:
@@ -85,9 +82,7 @@ def _of_array(values: np.ndarray) -> Iterator[float | str]:
 
 
 def _short(one: float | str) -> float | str:
-    if isinstance(one, str):
-        return one if len(one) <= _LONGEST else f"{one[:_LONGEST]}… {crc32(one.encode())}"
-    return float(f"{one:.8g}")
+    return one if isinstance(one, str) else float(f"{one:.8g}")
 
 
 def _differs(one: list[float | str], other: list[float | str] | None, relative: float) -> bool:

@@ -10,6 +10,7 @@ import json
 import pkgutil
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from zlib import crc32
 
 import pytest
 
@@ -45,8 +46,15 @@ def reading(cell: Cell, folder: Path) -> Figures:
     """What is read of the file of a cell, which is checked, but for what is checked already."""
     folder = folder / "files"
     folder.mkdir()
-    words = json.dumps(figures(cell.check(folder), LEFT_OUT))
-    return dict(json.loads(words.replace(str(folder), "<folder>")))
+    words = json.loads(
+        json.dumps(figures(cell.check(folder), LEFT_OUT)).replace(str(folder), "<folder>")
+    )
+    return {path: [_short(one) for one in values] for path, values in words.items()}
+
+
+def _short(one: float | str) -> float | str:
+    """Of a long text, such as a reference system, the beginning and a check sum."""
+    return f"{one[:60]}… {crc32(one.encode())}" if isinstance(one, str) and len(one) > 60 else one
 
 
 @pytest.fixture(scope="module")
