@@ -114,6 +114,18 @@ def two_tiles(folder: Path, **options) -> Path:
     return folder
 
 
+def stacked(folder: Path) -> Path:
+    """Three tiles, a gap in the south-east."""
+    tile(two_tiles(folder) / "c.tif", 5.0, 43.97)
+    return folder
+
+
+def two_steps(folder: Path) -> Path:
+    tile(folder / "a.tif", 5.0, 44.0)
+    tile(folder / "b.tif", 5.03, 44.0, step=0.0015, size=20)
+    return folder
+
+
 def vrt_of_tiles(folder: Path) -> Path:
     return vrt(two_tiles(folder))
 
@@ -124,16 +136,24 @@ def listed(folder: Path) -> Path:
     return folder / "tiles.txt"
 
 
-@pytest.mark.parametrize("write", [hgt, zipped, bil, asc, envi, vrt_of_tiles, two_tiles, listed])
-def test_a_terrain_of_any_kind_has_the_heights_of_its_ground(
-    write: Callable[[Path], Path], tmp_path: Path
+@pytest.mark.parametrize("fill_px", [0, 2])
+@pytest.mark.parametrize(
+    "write", [hgt, zipped, bil, asc, envi, vrt_of_tiles, two_tiles, listed, stacked, two_steps]
+)
+def test_a_terrain_of_any_kind_has_the_heights_of_its_ground_in_every_window(
+    write: Callable[[Path], Path], fill_px: int, tmp_path: Path
 ) -> None:
-    terrain = read_dem(write(tmp_path), "ellipsoid")
+    terrain = read_dem(write(tmp_path), "ellipsoid", fill_px=fill_px)
     whole_metres = 0.6
     assert terrain.height_m(PLACE)[0] == pytest.approx(plane(*PLACE.T)[0], abs=whole_metres)
-    again = pickle.loads(pickle.dumps(terrain.heights))
-    window = Window(3, 4, 5, 6)
-    np.testing.assert_array_equal(again.read(window), terrain.heights.read(window))
+    again, (lines, samples) = pickle.loads(pickle.dumps(terrain.heights)), terrain.heights.shape
+    expected = np.pad(terrain.nodes(), 3, constant_values=np.nan)
+    for line in {*range(-3, 64), *range(lines - 3, lines + 3)} & set(range(-3, lines + 3)):
+        found = again.read(Window(line, -3, 1, samples + 6))
+        np.testing.assert_allclose(found[0], expected[line + 3], atol=a_millimetre)
+    for sample in {*range(-3, 64), *range(samples - 3, samples + 3)} & set(range(-3, samples + 3)):
+        found = again.read(Window(-3, sample, lines + 6, 1))
+        np.testing.assert_allclose(found[:, 0], expected[:, sample + 3], atol=a_millimetre)
 
 
 def test_an_hgt_is_above_egm96_by_its_format_unless_the_caller_states_otherwise(tmp_path: Path) -> None:
@@ -201,9 +221,7 @@ def test_files_of_strangers_are_images_only(tmp_path: Path) -> None:
 
 
 def test_tiles_of_one_lattice_are_copied_and_their_gaps_are_void(tmp_path: Path) -> None:
-    two_tiles(tmp_path)
-    tile(tmp_path / "c.tif", 5.0, 43.97)
-    terrain = read_dem(tmp_path, "ellipsoid")
+    terrain = read_dem(stacked(tmp_path), "ellipsoid")
     assert terrain.grid.shape == (60, 60)
     heights = terrain.nodes()
     with rasterio.open(tmp_path / "b.tif") as file:
@@ -214,9 +232,7 @@ def test_tiles_of_one_lattice_are_copied_and_their_gaps_are_void(tmp_path: Path)
 
 
 def test_tiles_of_other_steps_and_maps_are_interpolated(tmp_path: Path) -> None:
-    tile(tmp_path / "a.tif", 5.0, 44.0)
-    tile(tmp_path / "b.tif", 5.03, 44.0, step=0.0015, size=20)
-    terrain = read_dem(tmp_path, "ellipsoid")
+    terrain = read_dem(two_steps(tmp_path), "ellipsoid")
     lon_lat = np.column_stack([np.linspace(5.002, 5.058, 60), np.linspace(43.998, 43.974, 60)])
     height_m = terrain.height_m(lon_lat)
     a_step_of_the_plane_m = 2.0
