@@ -17,6 +17,7 @@ from amers.services.formats.gcp.base_chips import open_base_chip, read_base_chip
 from amers.services.formats.gcp.gcplib import gcplib_records, parse_gcplib
 from amers.services.formats.gcp.reader import StatedByCaller, read_ground_points
 from amers.services.imagery.scene import Scene
+from amers.services.imagery.source import Window
 from amers.services.map_grid import xy_of_lon_lat
 from amers.services.sensors.ortho import OrthoModel
 from tests.services.chip_bases import base_points, brightness, chip_around, write_copernicus
@@ -57,11 +58,20 @@ def gcplib_bytes(records: list[tuple[object, ...]]) -> bytes:
     return ("\n".join(lines) + "\n").encode("ascii")
 
 
-def record(number: int, lon_lat: tuple[float, float], zone: int, xy: np.ndarray) -> tuple[object, ...]:
-    """A record with a chip of 64 pixels of 15 m, whose point is at its pixel (32, 32) from (0, 0)."""
+def record(
+    number: int,
+    lon_lat: tuple[float, float],
+    zone: int,
+    xy: np.ndarray,
+    pixels: tuple[float, ...] = (15.0, 15.0, 64.0, 64.0),
+) -> tuple[object, ...]:
+    """A record with a point at the pixel (32, 32) of a chip, counted from (0, 0).
+
+    Its pixels are given by their steps in x and y, metres, and the numbers of lines and samples.
+    """
     place = (32.0, 32.0, lon_lat[1], lon_lat[0], float(xy[1]), float(xy[0]), 90.0)
     kind = ("GLS+", "GRAYSCALE", "UTM", zone, "07-14-1999", "ABS", "BYTE")
-    return (str(number), f"p190r031_{number:04d}_chip", *place, 15.0, 15.0, 64.0, 64.0, *kind)
+    return (str(number), f"p190r031_{number:04d}_chip", *place, *pixels, *kind)
 
 
 def test_points_and_chips_of_the_writer_of_the_usgs(tmp_path: Path) -> None:
@@ -97,18 +107,26 @@ def test_a_set_without_points_is_empty() -> None:
 def test_chips_south_of_the_equator_lie_where_their_latitude_says(
     tmp_path: Path, zone: int, false_northing_m: float
 ) -> None:
-    """The Perl of the USGS accepts no sign of a zone; northings may count from either origin."""
+    """The Perl of the USGS accepts no sign of a zone; northings may count from either origin.
+
+    Pixels of 15 m from west to east are 30 m from north to south; there are 64 lines of 48.
+    """
     lon_lat = (15.2, -12.5)
     xy = xy_of_lon_lat("EPSG:32633", np.array([lon_lat]))[0] + [0.0, false_northing_m]
     path = tmp_path / "GCPLib"
-    path.write_bytes(gcplib_bytes([record(1, lon_lat, zone, xy)]))
+    path.write_bytes(gcplib_bytes([record(1, lon_lat, zone, xy, (15.0, 30.0, 64.0, 48.0))]))
     (found,) = gcplib_records(path.read_text())
     assert found.crs == ("EPSG:32733" if false_northing_m else "EPSG:32633")
-    (tmp_path / "p190r031_0001_chip").write_bytes(bytes(range(1, 65)) * 64)
+    values = np.arange(64 * 48, dtype=np.uint8).reshape(64, 48) | 1
+    (tmp_path / "p190r031_0001_chip").write_bytes(values.tobytes())
     scene = open_base_chip(read_base_chips(path, tmp_path, "centre")[0])
     assert isinstance(scene, Scene)
     assert isinstance(scene.model, OrthoModel)
-    assert np.allclose(scene.model.grid.lon_lat(np.array([[32.0, 32.0]]))[0], lon_lat, atol=A_METRE_DEG)
+    corners = np.array([[32.0, 32.0], [0.0, 0.0], [63.0, 47.0]])
+    expected = xy + (corners - 32.0)[:, ::-1] * [15.0, -30.0]
+    assert np.allclose(scene.model.grid.xy(corners), expected, atol=0.01)
+    assert np.allclose(scene.model.grid.lon_lat(corners)[0], lon_lat, atol=A_METRE_DEG)
+    np.testing.assert_array_equal(scene.image.read(Window(0, 0, 64, 48)), values)
 
 
 def test_an_unpacked_archive_of_the_copernicus_database_is_read(tmp_path: Path) -> None:

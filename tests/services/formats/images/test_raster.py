@@ -8,9 +8,15 @@ import rasterio
 from hypothesis import given
 from hypothesis import strategies as st
 from rasterio.enums import Resampling
+from rasterio.transform import Affine
 
 from amers.services.errors import FormatError
-from amers.services.formats.images.raster import copy_with_rpc, open_raster, write_raster
+from amers.services.formats.images.raster import (
+    copy_with_rpc,
+    map_grid_of,
+    open_raster,
+    write_raster,
+)
 from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
 from amers.services.imagery.source import ArrayImage, Window, quick_view
 
@@ -42,6 +48,31 @@ def test_any_window_of_a_file_is_the_window_of_the_array(
     image.close()
     assert read.dtype == np.float32
     np.testing.assert_array_equal(read, ArrayImage(PIXELS.astype(np.float32)).read(window))
+
+
+@pytest.mark.parametrize("files", ["own", "world", "aux", "own world", "own aux", "world aux"])
+def test_a_turned_map_is_where_gdal_has_it_whichever_files_state_it(tmp_path: Path, files: str) -> None:
+    """Its pixels are oblong and askew, and each file states another place."""
+    own, world, aux = (Affine(10.0 + k, 2.0, 5e5 + k, 3.0, -7.0, 4.8e6) for k in range(3))
+    placed = {"transform": own} if "own" in files else {}
+    path = write(tmp_path / "a.tif", crs="EPSG:32631", **placed)
+    if "world" in files:
+        centre = world @ Affine.translation(0.5, 0.5)
+        numbers = (centre.a, centre.d, centre.b, centre.e, centre.c, centre.f)
+        path.with_suffix(".tfw").write_text("\n".join(map(str, numbers)))
+    if "aux" in files:
+        text = ",".join(map(str, aux.to_gdal()))
+        pam = f"<PAMDataset><GeoTransform>{text}</GeoTransform></PAMDataset>"
+        (tmp_path / "a.tif.aux.xml").write_text(pam)
+    with rasterio.open(path) as file:
+        expected = file.transform
+    image = open_raster(path)
+    grid = map_grid_of(image)
+    image.close()
+    assert grid is not None
+    at = np.array([[0.0, 0.0], [89.0, 0.0], [0.0, 119.0], [40.25, 7.5]])
+    xy = [expected @ (sample + 0.5, line + 0.5) for line, sample in at.tolist()]
+    np.testing.assert_allclose(grid.xy(at), xy, rtol=0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize(
