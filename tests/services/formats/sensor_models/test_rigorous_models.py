@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,10 @@ from amers.services.formats.sensor_models.phr_dimap import parse_phr_dimap
 from amers.services.formats.sensor_models.rigorous_model import read_rigorous_model
 from amers.services.formats.sensor_models.rpc_files import read_rpc, write_model
 from amers.services.formats.sensor_models.spot_dimap import parse_spot_dimap
-from amers.services.formats.sensor_models.worldview_isd import parse_worldview_isd
+from amers.services.formats.sensor_models.worldview_isd import (
+    parse_isd_acquisition,
+    parse_worldview_isd,
+)
 from amers.services.sensors.light_path import GEOMETRIC, LightPath
 from amers.services.sensors.pushbroom import PushbroomModel
 from tests.services.formats.sensor_models import simulated_metadata as simulated
@@ -58,6 +62,30 @@ def test_lines_of_sight_begin_at_the_perspective_centre_beside_the_middle_of_the
     centre_m = body.inv().apply(moved - plain)
     np.testing.assert_allclose(centre_m, np.tile([3.5, -2.0, 1.5], (50, 1)), atol=1e-3)
     np.testing.assert_allclose(moved_direction, direction, atol=1e-12)
+
+
+def test_a_turned_row_of_detectors_sees_what_a_camera_turned_as_much_sees() -> None:
+    text, angle = simulated.worldview_isd(simulated.truth(GEOMETRIC)), np.radians(20.0)
+    of_camera = text.replace("<QCS3>0<", f"<QCS3>{np.sin(angle / 2.0)}<")
+    of_camera = of_camera.replace("<QCS4>1<", f"<QCS4>{np.cos(angle / 2.0)}<")
+    of_row = text.replace("<DETROTANGLE>0<", f"<DETROTANGLE>{np.degrees(angle)}<")
+    x, y = (float(text.partition(f"<DETORIGIN{axis}>")[2].partition("<")[0]) for axis in "XY")
+    turned = Rotation.from_rotvec([0.0, 0.0, angle]).apply([x, y, 0.0])
+    for axis, value in zip("XY", turned, strict=False):
+        of_row = re.sub(f"<DETORIGIN{axis}>[^<]*<", f"<DETORIGIN{axis}>{value}<", of_row)
+    image = np.random.default_rng(5).uniform(0.0, 1.0, (50, 2)) * simulated.SHAPE
+    expected, found = (parse_worldview_isd(one).line_of_sight(image) for one in (of_camera, of_row))
+    np.testing.assert_allclose(found[1], expected[1], atol=1e-12)
+
+
+def test_sensor_time_and_sun_of_a_worldview_product_are_not_those_of_the_satellite() -> None:
+    values = {"SATID": "WV02", "FIRSTLINETIME": "2012-03-04T10:36:09.123456Z"}
+    angles = {"MEANSUNAZ": 142.5, "MEANSUNEL": 52.25, "MEANSATAZ": 230.0, "MEANSATEL": 71.0}
+    entries = "".join(f"<{name}>{value}</{name}>" for name, value in (values | angles).items())
+    found = parse_isd_acquisition(f"<isd><IMD><IMAGE>{entries}</IMAGE></IMD></isd>", "image")
+    assert (found.image_id, found.sensor) == ("image", "WV02")
+    assert found.acquired_at == datetime(2012, 3, 4, 10, 36, 9, 123_456, tzinfo=UTC)
+    assert (found.sun_azimuth_deg, found.sun_elevation_deg) == (142.5, 52.25)
 
 
 @pytest.mark.parametrize("product", PRODUCTS)

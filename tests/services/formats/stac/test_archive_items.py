@@ -58,6 +58,17 @@ def test_names_that_catalogues_use_are_read(
     assert (image.tile, image.orbit, image.baseline) == (tile, orbit, baseline)
 
 
+def test_clouds_snow_and_the_sun_are_those_that_the_item_states_each_under_its_name() -> None:
+    stated = {"eo:cloud_cover": 20.0, "eo:snow_cover": 5.0}
+    stated |= {"view:sun_elevation": 41.0, "view:sun_azimuth": 152.0}
+    image = archive_image(item(**stated), SENTINEL_2, "test")
+    assert (image.cloud, image.snow, image.sun_deg) == (0.2, 0.05, (41.0, 152.0))
+    bare = archive_image(item(), SENTINEL_2, "test")
+    assert (bare.cloud, bare.snow) == (0.0, 0.0)
+    # An hour before noon: declination 15.2, hour angle -15.3 degrees, by spherical trigonometry.
+    assert bare.sun_deg == pytest.approx((58.8, 150.7), abs=0.5)
+
+
 def test_the_offset_and_the_accuracy_follow_the_baseline() -> None:
     stated = {"s2:processing_baseline": "05.10"}
     new = archive_image(item(**stated), SENTINEL_2, "test")

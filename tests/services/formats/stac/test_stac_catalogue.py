@@ -16,6 +16,8 @@ from hypothesis import strategies as st
 from amers.services.errors import FormatError
 from amers.services.formats.stac.catalogue import parse_mask, read_catalogue
 from amers.services.formats.stac.items import parse_item
+from amers.services.formats.stac.scenes import read_item_scene
+from tests.services.formats.statements.catalogue_cells import written_item
 
 SQUARE = {"type": "Polygon", "coordinates": [[[10, 0], [11, 0], [11, 1], [10, 1], [10, 0]]]}
 
@@ -164,6 +166,19 @@ def test_garbled_items_are_refused_or_read_but_never_crash(field, value, inside)
         garbled[field] = value
     with suppress(FormatError):
         assert not shapely.is_empty(parse_item(garbled, "x").footprint)
+
+
+def test_the_scene_of_an_item_has_the_accuracy_of_its_kind_and_the_name_time_and_sun_of_the_item(
+    tmp_path,
+):
+    sun = {"view:sun_elevation": 41.0, "view:sun_azimuth": 152.0}
+    one = written_item(tmp_path, lambda item: item["properties"].update(sun))
+    scene = read_item_scene(one, "x", sigma_m=5.0, ortho_sigma_m=2.0)
+    assert (scene.sigma_m, read_item_scene(one, "x", sigma_m=5.0).sigma_m) == (2.0, 5.0)
+    taken = scene.acquisition
+    assert (taken.image_id, taken.sensor) == ("one", "sentinel-2a")
+    assert taken.acquired_at == datetime(2024, 5, 1, 10, tzinfo=UTC)
+    assert (taken.sun_elevation_deg, taken.sun_azimuth_deg) == (41.0, 152.0)
 
 
 # Masks
