@@ -7,6 +7,7 @@ import pytest
 import shapely
 
 from amers.services.errors import InputError
+from amers.services.imagery.source import ArrayImage
 from amers.services.map_grid import xy_of_lon_lat
 from amers.services.vectors.accuracy import ErrorSources
 from amers.services.vectors.correct import correct_vectors
@@ -66,6 +67,15 @@ def test_ground_behind_a_ridge_is_hidden_and_a_tower_is_not() -> None:
     assert 0.05 < points.hidden.mean() < 0.6
     towers = shapely.points(np.column_stack([xy, np.full(500, float(heights(120.0).max()) + 1.0)]))
     assert not project_vectors(shapes_of(towers), view, ground, CRS, tolerance_px=0.2).hidden.any()
+    # It is looked for as far as the image goes, to the outer border of its last pixels.
+    for row in np.flatnonzero(points.hidden)[:10]:
+        last, one = np.rint(points.shapes.vertices[row]).astype(int), points.shapes.vertices[row]
+        at = shapes_of(shapely.points(xy_of_lon_lat(CRS, points.lon_lat_h[row : row + 1, :2])))
+        for cut_off, expected in (((1, 1), True), ((0, 1), False), ((1, 0), False)):
+            image = ArrayImage(np.ones(last + cut_off, dtype=np.float32))
+            part = project_vectors(at, replace(view, image=image), ground, CRS, tolerance_px=0.2)
+            np.testing.assert_allclose(part.shapes.vertices[0], one, atol=1e-6)
+            assert part.hidden[0] == expected
     line = shapes_of(np.array([None, shapely.LineString(xy)], dtype=object))
     share = hidden_share(project_vectors(line, view, ground, CRS, tolerance_px=0.2))
     assert np.isnan(share[0])
