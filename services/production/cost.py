@@ -91,7 +91,8 @@ def production_cost(
     pixels = [one.size_m[0] * one.size_m[1] / one.gsd_m**2 for one in images]
     coarsest_m = max(one.gsd_m for one in images)
     features = FeatureOptions().for_chips(coarsest_m, fine_gsd_m or coarsest_m)
-    searched = [searched_pixels(one, min(pixels), points * views / count, features) for one in pixels]
+    smallest = min(pixels)
+    searched = [searched_pixels(one, smallest, points * views / count, features) for one in pixels]
     partners = min(PARTNERS, count - 1)
     observations = points * views * _CANDIDATES
     found_mpx = sum(found for found, _ in searched) / 1e6
