@@ -24,7 +24,7 @@ from amers.services.formats.sensor_models.correction_json import (
     parse_correction,
     parse_correction_accuracy,
 )
-from amers.services.formats.sensor_models.dimap import format_dimap_rpc, parse_dimap_rpc
+from amers.services.formats.sensor_models.dimap import format_dimap_rpc
 from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
 from amers.services.formats.vector.residual_layers import write_residual_layers
 from amers.services.map_grid import MapGrid
@@ -112,13 +112,6 @@ def test_a_refined_dimap_differs_from_the_delivered_one_in_four_numbers(name: st
 
 
 @both_versions
-def test_a_refined_dimap_is_read_as_the_corrected_model(name: str) -> None:
-    model = parse_dimap_rpc((GOLDEN / f"{name}_refined.XML").read_text())
-    actual, expected = model.project(ground()), refined().project(ground())
-    np.testing.assert_allclose(actual, expected, atol=a_millionth_of_a_pixel, rtol=0)
-
-
-@both_versions
 def test_gdal_reads_a_refined_dimap_as_the_corrected_model(name: str, tmp_path: Path) -> None:
     text = format_dimap_rpc((GOLDEN / f"{name}.XML").read_text(), refined())
     (tmp_path / "RPC_a.XML").write_text(text)
@@ -184,6 +177,14 @@ def measures() -> Measures:
     )
 
 
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The layers of residuals."""
+    made = tmp_path_factory.mktemp("layers") / "residuals.gpkg"
+    write_residual_layers(made, measures(), "invented", RESIDUALS["exaggeration"])
+    return made
+
+
 def rows_of(path: Path, layer: str) -> tuple[list[dict], list[np.ndarray]]:
     """Attributes and coordinates of a layer of a GeoPackage, from its SQLite and its WKB."""
     with sqlite3.connect(path) as database:
@@ -208,9 +209,7 @@ def rows_of(path: Path, layer: str) -> tuple[list[dict], list[np.ndarray]]:
     return rows, shapes
 
 
-def test_the_layers_of_residuals_have_the_golden_rows_and_lines(tmp_path: Path) -> None:
-    path = tmp_path / "residuals.gpkg"
-    write_residual_layers(path, measures(), "invented", RESIDUALS["exaggeration"])
+def test_the_layers_of_residuals_have_the_golden_rows_and_lines(path: Path) -> None:
     golden = RESIDUALS["points"]
     rows, places = rows_of(path, "control_points")
     assert len(rows) == len(golden)
@@ -228,9 +227,7 @@ def test_the_layers_of_residuals_have_the_golden_rows_and_lines(tmp_path: Path) 
         np.testing.assert_allclose(line[1], expected["line_to"], atol=a_nanodegree, rtol=0)
 
 
-def test_gdal_reads_both_layers_of_residuals_with_their_reference_system(tmp_path: Path) -> None:
-    path = tmp_path / "residuals.gpkg"
-    write_residual_layers(path, measures(), "invented", RESIDUALS["exaggeration"])
+def test_gdal_reads_both_layers_of_residuals_with_their_reference_system(path: Path) -> None:
     kinds = {name: pyogrio.read_info(path, layer=name) for name, _ in pyogrio.list_layers(path)}
     assert {name: info["geometry_type"] for name, info in kinds.items()} == {
         "held_area": "MultiPolygon",
@@ -241,9 +238,7 @@ def test_gdal_reads_both_layers_of_residuals_with_their_reference_system(tmp_pat
     assert {kinds[name]["crs"] for name in ("residuals", "control_points")} == {"EPSG:4979"}
 
 
-def test_qgis_finds_arrows_of_residuals_in_the_colours_of_the_report(tmp_path: Path) -> None:
-    path = tmp_path / "residuals.gpkg"
-    write_residual_layers(path, measures(), "invented", RESIDUALS["exaggeration"])
+def test_qgis_finds_arrows_of_residuals_in_the_colours_of_the_report(path: Path) -> None:
     with closing(sqlite3.connect(path)) as database:
         columns = dict(database.execute("select table_name, column_name from gpkg_geometry_columns"))
         styles = database.execute(

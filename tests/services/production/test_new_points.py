@@ -19,11 +19,11 @@ from amers.services.production.new_points import (
     short_ground,
     shown_twice,
 )
-from amers.services.production.placed_block import moved_model
 from amers.services.production.renewed_views import SeeingScene, with_new_points, with_new_views
 from amers.services.quality.stability import image_places
 from amers.services.registration.on_points import register_scene
 from amers.services.registration.options import RegistrationOptions
+from amers.services.sensors.rpc import RpcModel
 from amers.services.types import Array, ChipSource, ControlPoints
 from tests.services.block_with_hole import (
     HOLE_M,
@@ -37,6 +37,7 @@ from tests.services.block_with_hole import (
     simulated,
     true_places,
 )
+from tests.services.production.test_renewed_views import CENTRE, old_points, scene
 from tests.services.simulated import MemoryChips
 from tests.services.ties import difference_m, whitened_square
 
@@ -224,20 +225,25 @@ def test_the_frame_covers_what_the_new_points_share_and_what_the_others_do() -> 
 
 
 def test_scenes_that_do_not_overlap_are_apart() -> None:
-    scenes = registered(SEEDS[0])
-    away = [
-        replace(scene, model=moved_model(view.geometry.delivered, np.array([5000.0, 0.0, 0.0])))
-        for scene, view in zip(scenes, simulated(SEEDS[0], SIGMA_M), strict=True)
-    ]
-    groups = overlapping_scenes([scenes[0], away[0], scenes[1], away[1], scenes[2]])
-    assert groups == [[scenes[0], scenes[1], scenes[2]], [away[0], away[1]]]
-    assert overlapping_scenes([scenes[0], away[0]]) == []
+    one, other = scene("one", 0.5, 1), scene("other", 0.5, 1)
+    east = [replace(of, model=shifted(of.model)) for of in (one, other)]
+    groups = overlapping_scenes([one, east[0], other, east[1], one])
+    assert groups == [[one, other, one], east]
+    assert overlapping_scenes([one, east[0]]) == []
+
+
+def shifted(model: RpcModel) -> RpcModel:
+    """A model of ground some kilometres farther east."""
+    return replace(model, ground_offset=model.ground_offset + [0.05, 0.0, 0.0])
 
 
 def test_scenes_that_show_no_common_detail_make_no_points() -> None:
-    scenes = registered(SEEDS[0])[:2]
-    _, block, _ = older()
-    noise = np.random.default_rng(0).normal(1000.0, 100.0, scenes[1].image.shape)
-    blank = replace(scenes[1], image=ArrayImage(noise.astype(np.float32)))
+    rng = np.random.default_rng(0)
+    noise = [
+        replace(of, image=ArrayImage(rng.normal(1000.0, 100.0, of.image.shape).astype(np.float32)))
+        for of in (scene("one", 0.5, 1), scene("other", 0.5, 1))
+    ]
+    outline = CENTRE + 1e-3 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    everywhere = ShortGround(outline, 50.0, np.empty((0, 2), dtype=np.int64))
     with pytest.raises(ComputationError):
-        points_where_short([scenes[0], blank], block.points, hole(), min_views=2)
+        points_where_short(noise, old_points(4)[0], everywhere, min_views=2)

@@ -129,6 +129,8 @@ def test_missing_pixels_and_unknown_heights_give_no_points() -> None:
     assert seen[:, 1].min() > SIDE / 2 + 0.4 * CHIP_SIZE - 1
     assert seen[:, 0].min() > SIDE / 2 - 1
     np.testing.assert_allclose(points.lon_lat_h[:, 2], 40.0)
+    # A terrain model does not say whether roofs and trees are in it, and one image does not show it.
+    assert points.surface is None
 
 
 @pytest.mark.thorough
@@ -156,17 +158,6 @@ def test_a_patch_without_data_costs_the_points_that_it_covers() -> None:
     assert len(missing) > 10
     assert (missing > 0.0).any()
     assert missing.max() <= 0.1
-
-
-@pytest.mark.thorough
-def test_the_height_of_the_surface_is_unknown() -> None:
-    # A terrain model does not say whether roofs and trees are in it, and one image does not show it.
-    grid = ortho(land()).model.grid  # type: ignore[attr-defined]
-    heights = ArrayImage(np.full((SIDE, SIDE), 40.0, dtype=np.float32))
-    points = produce_ortho_points(
-        [ortho(land())], GroundHeights(Terrain(grid, heights, sigmas=3.0))
-    ).points
-    assert points.surface is None
 
 
 def test_points_on_both_sides_of_180_degrees_form_one_block() -> None:

@@ -1,7 +1,6 @@
 """How far images of one place disagree, against what they state, and which points they confirm."""
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -57,26 +56,15 @@ LOCAL_M = 2.0
 LAY_OFF_M = np.array([[0.0, 0.0], [6.0, -9.0], [-12.0, 20.0]])
 
 
-@cache
-def three_images() -> tuple[Array, AgreedViews]:
-    """Images in which each detail is displaced by its own vector (3, m, 2); all of each lie off."""
-    rng = np.random.default_rng(7)
-    details = drawn_details(DETAILS)
+def test_images_are_brought_onto_the_first_of_them_and_are_as_wrong_as_they_were_drawn() -> None:
+    """Two images disagree by the errors of both."""
+    rng, details = np.random.default_rng(7), drawn_details(DETAILS)
     off_m = rng.normal(0.0, LOCAL_M, (3, DETAILS**2, 2)) + LAY_OFF_M[:, None]
     images = [details.scene(f"image {k}", off_m[k], 20.0) for k in range(3)]
-    return off_m, agreed_views(images, details.lon_lat_h, GSD_M)
-
-
-def test_details_of_one_image_are_as_wrong_as_they_were_drawn() -> None:
-    """Two images disagree by the errors of both."""
-    assert three_images()[1].local_sigma_m == pytest.approx(LOCAL_M, rel=0.25)
-
-
-def test_images_are_brought_onto_the_first_of_them() -> None:
-    off_m, views = three_images()
+    views = agreed_views(images, details.lon_lat_h, GSD_M)
+    assert views.local_sigma_m == pytest.approx(LOCAL_M, rel=0.25)
     expected_m = np.median(off_m - off_m[0], axis=1)
     np.testing.assert_allclose(views.shift_m, expected_m, atol=0.5 * LOCAL_M)
-    details = drawn_details(DETAILS)
     for k, scene in enumerate(views.scenes):
         shown = scene.model.project(details.lon_lat_h) - details.model.project(details.lon_lat_h)
         seen_m = (shown * [-GSD_M, GSD_M])[:, ::-1]

@@ -193,12 +193,7 @@ def test_points_that_are_switched_off_are_left_out_and_check_points_stay(tmp_pat
 
 
 def test_points_without_heights_need_no_datum(tmp_path: Path) -> None:
-    for text in (
-        "lon,lat\n12.3,41.9\n",
-        TEXTS["invented.points"]
-        if "invented.points" in TEXTS
-        else (GOLDEN / "invented.points").read_text(),
-    ):
+    for text in ("lon,lat\n12.3,41.9\n", (GOLDEN / "invented.points").read_text()):
         points = read_ground_points(written(tmp_path, "flat", text))
         assert np.isnan(points.lon_lat_h[:, 2]).all()
 
