@@ -14,7 +14,7 @@ import pyogrio
 import pytest
 import rasterio
 import shapely
-from pyproj import CRS
+from pyproj import CRS, Geod
 from rasterio.transform import Affine, RPCTransformer
 from rasterio.warp import transform
 
@@ -26,7 +26,7 @@ from amers.services.formats.sensor_models.correction_json import (
 )
 from amers.services.formats.sensor_models.dimap import format_dimap_rpc
 from amers.services.formats.sensor_models.rpc_text import parse_rpc_text
-from amers.services.formats.vector.residual_layers import write_residual_layers
+from amers.services.formats.vector.residual_layers import exaggeration_for, write_residual_layers
 from amers.services.map_grid import MapGrid
 from amers.services.quality.correction_accuracy import CorrectionAccuracy
 from amers.services.reports.drawing import ACTIVE, DEACTIVATED, NOT_MATCHED
@@ -179,10 +179,25 @@ def measures() -> Measures:
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The layers of residuals."""
+    """The layers of residuals, which replace older ones."""
     made = tmp_path_factory.mktemp("layers") / "residuals.gpkg"
-    write_residual_layers(made, measures(), "invented", RESIDUALS["exaggeration"])
+    for exaggeration in (1.0, RESIDUALS["exaggeration"]):
+        write_residual_layers(made, measures(), "invented", exaggeration)
     return made
+
+
+@pytest.mark.parametrize("factor", [1e-4, 1.0, 3.0, 1e4])
+def test_most_residuals_are_drawn_up_to_a_25th_of_the_diagonal_of_the_points(factor: float) -> None:
+    """By 1, 2 or 5 times a power of ten, never smaller than they are."""
+    scaled = replace(measures(), residual_m=factor * measures().residual_m)
+    found, (lon, lat) = exaggeration_for(scaled), scaled.lon_lat_h[:, :2].T
+    length_m = np.linalg.norm(scaled.residual_m[scaled.active], axis=1)
+    drawn_m = found * np.quantile(length_m, 0.9)
+    diagonal_m = Geod(ellps="WGS84").inv(lon.min(), lat.min(), lon.max(), lat.max())[2]
+    assert f"{found:e}"[0] in "125"
+    assert found >= 1.0
+    assert drawn_m <= 1.001 * diagonal_m / 25.0 or found == 1.0
+    assert 2.5 * drawn_m > 0.999 * diagonal_m / 25.0
 
 
 def rows_of(path: Path, layer: str) -> tuple[list[dict], list[np.ndarray]]:

@@ -25,6 +25,7 @@ from amers.services.orthorectification.rectify import (
     choose_grid,
     orthorectify,
 )
+from amers.services.sensors.base import SensorModel
 from amers.services.sensors.rpc_fit import fit_rpc
 from amers.services.simulation.orbit import pushbroom_over
 from amers.services.terrain import Terrain
@@ -64,10 +65,16 @@ def ramps() -> list[ArrayImage]:
     return [ArrayImage(axis.astype(np.float32)) for axis in np.indices(SHAPE)]
 
 
-def assembled(images: list[ArrayImage], ground: Terrain, grid: MapGrid, **changes: object) -> FloatImage:
+def assembled(
+    images: list[ArrayImage],
+    ground: Terrain,
+    grid: MapGrid,
+    model: SensorModel | None = None,
+    **changes: object,
+) -> FloatImage:
     out = np.zeros((len(images), *grid.shape), dtype=np.float32)
     options = replace(OrthoOptions(), **changes)  # type: ignore[arg-type]
-    for ortho in orthorectify(images, scene().model, ground, grid, options):
+    for ortho in orthorectify(images, model or scene().model, ground, grid, options):
         at = ortho.window
         assert ortho.error_px <= options.tolerance_px
         out[:, at.line : at.line + at.lines, at.sample : at.sample + at.samples] = ortho.pixels
@@ -452,15 +459,8 @@ def test_a_much_coarser_map_shows_the_image_however_it_is_divided(ratio: float) 
     step = np.array([[0.0, 1.0], [-1.0, 0.0]]) * 0.5 * ratio * METRE_DEG
     grid = MapGrid("EPSG:4326", step @ np.full(2, 0.5), step, (49, 49))
     noise = np.random.default_rng(5).normal(500.0, 200.0, (side, side)).astype(np.float32)
-
-    def rendered(window_px: int) -> FloatImage:
-        out = np.full(grid.shape, np.nan, dtype=np.float32)
-        options = OrthoOptions(window_px=window_px)
-        for one in orthorectify([ArrayImage(noise)], model, ground, grid, options):
-            at = one.window
-            out[at.line : at.line + at.lines, at.sample : at.sample + at.samples] = one.pixels[0]
-        return out
-
-    whole = rendered(512)
+    whole, divided = (
+        assembled([ArrayImage(noise)], ground, grid, model, window_px=px) for px in (512, 16)
+    )
     assert np.isfinite(whole).all()
-    np.testing.assert_allclose(rendered(16), whole, atol=1e-3)
+    np.testing.assert_allclose(divided, whole, atol=1e-3)

@@ -9,7 +9,6 @@ from amers.services.errors import CoverageError
 from amers.services.sensors.correction import (
     CorrectedModel,
     ImageCorrection,
-    fold_into_rpc,
     no_correction,
 )
 from amers.services.sensors.pushbroom import PushbroomModel
@@ -90,10 +89,7 @@ def test_the_error_of_a_bad_fit_is_reported_in_full() -> None:
 def test_a_full_affine_is_refitted_within_a_hundredth_of_a_pixel() -> None:
     shape = (5000, 4000)
     rpc = fit_rpc(a_pushbroom(shape), shape, HEIGHTS_M).model
-    plain = no_correction(shape)
-    affine = ImageCorrection(
-        np.array([[40.0, 3.0, -2.0], [-25.0, 1.5, 4.0]]), plain.centre, plain.half_size
-    )
+    affine = ImageCorrection(np.array([[40.0, 3.0, -2.0], [-25.0, 1.5, 4.0]]), *_frame(shape))
     corrected = CorrectedModel(rpc, affine)
     fit = fit_rpc(corrected, shape, HEIGHTS_M)
     assert fit.max_error_px < a_hundredth_of_a_pixel
@@ -129,17 +125,6 @@ def test_an_affine_is_refitted_on_few_points_and_a_jitter_on_more() -> None:
 def _frame(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     plain = no_correction(shape)
     return plain.centre, plain.half_size
-
-
-def test_a_refitted_drift_agrees_with_the_folded_one() -> None:
-    shape = (3000, 3000)
-    rpc = fit_rpc(a_pushbroom(shape), shape, HEIGHTS_M).model
-    plain = no_correction(shape)
-    drift = ImageCorrection(
-        np.array([[10.0, 2.0, 0.0], [-5.0, 0.0, -1.0]]), plain.centre, plain.half_size
-    )
-    refitted = fit_rpc(CorrectedModel(rpc, drift), shape, HEIGHTS_M).model
-    assert error_px(fold_into_rpc(rpc, drift), refitted, shape).max() < a_hundredth_of_a_pixel
 
 
 def test_a_model_that_does_not_cover_the_heights_is_refused_with_numbers() -> None:

@@ -158,20 +158,28 @@ def test_any_point_survives_a_round_trip(write, parse, golden: str, data: st.Dat
     assert np.abs(moved).max(initial=0) < a_micrometre
 
 
-def test_gdal_recovers_the_geotransform_of_a_map_image_from_qgis_marks() -> None:
+def test_gdal_recovers_a_geotransform_from_marks_of_qgis_and_pci(
+    tmp_path: Path,
+) -> None:
     """QGIS passes its points to GDAL as column and negative row."""
-    origin_lon, origin_lat, step = 12.0, 42.0, 1e-4
+    place = Affine(1e-4, 0.0, 12.0, 0.0, -1e-4, 42.0)
     line_sample = np.array([[0.0, 0.0], [0.0, 999.0], [799.0, 999.0], [799.0, 0.0], [400.0, 500.0]])
-    lon = origin_lon + (line_sample[:, 1] + 0.5) * step
-    lat = origin_lat - (line_sample[:, 0] + 0.5) * step
+    lon, lat = place @ (line_sample.T[::-1] + CORNER_OF_FIRST_PIXEL)
     points = marked_points(["a", "b", "c", "d", "e"], np.column_stack([lon, lat, 0 * lon]), line_sample)
-    gcps = [
+    of_qgis = [
         GroundControlPoint(row=-minus_row, col=column, x=x, y=y)
         for x, y, column, minus_row, *_ in numbers(format_qgis_points(points))
     ]
-    fitted = from_gcps(gcps)
-    assert (fitted.c, fitted.f) == pytest.approx((origin_lon, origin_lat), abs=a_nanodegree)
-    assert (fitted.a, fitted.e) == pytest.approx((step, -step), rel=1e-9)
+    of_pci = [
+        GroundControlPoint(row=line, col=pixel, x=x, y=y, z=z)
+        for pixel, line, x, y, z in numbers(format_pci_text(points))
+    ]
+    path, stored = tmp_path / "a.pix", {"gcps": of_pci, "crs": "EPSG:4326"}
+    with rasterio.open(path, "w", "PCIDSK", 1000, 800, 1, dtype=np.uint8, **stored):
+        pass
+    with rasterio.open(path) as file:
+        for gcps in (of_qgis, file.gcps[0]):
+            assert from_gcps(gcps).almost_equals(place, precision=a_nanodegree)
 
 
 def test_the_image_centre_is_the_centre_for_odm() -> None:
@@ -180,25 +188,6 @@ def test_the_image_centre_is_the_centre_for_odm() -> None:
     middle = marked_points(["a"], [(12.0, 42.0, 0.0)], [((lines - 1) / 2, (samples - 1) / 2)])
     _, _, _, im_x, im_y, *_ = numbers(format_gcp_list(middle))[0]
     assert ((im_x + 0.5 - samples / 2) / samples, (im_y + 0.5 - lines / 2) / samples) == (0.0, 0.0)
-
-
-def test_gdal_recovers_the_geotransform_of_a_map_image_from_a_pci_file_with_pci_text_points(
-    tmp_path: Path,
-) -> None:
-    place = Affine(1e-4, 0.0, 12.0, 0.0, -1e-4, 42.0)
-    line_sample = np.array([[0.0, 0.0], [0.0, 999.0], [799.0, 999.0], [799.0, 0.0], [400.0, 500.0]])
-    lon, lat = place @ (line_sample.T[::-1] + CORNER_OF_FIRST_PIXEL)
-    points = marked_points(["a", "b", "c", "d", "e"], np.column_stack([lon, lat, 0 * lon]), line_sample)
-    gcps = [
-        GroundControlPoint(row=line, col=pixel, x=x, y=y, z=z)
-        for pixel, line, x, y, z in numbers(format_pci_text(points))
-    ]
-    path = tmp_path / "a.pix"
-    with rasterio.open(path, "w", "PCIDSK", 1000, 800, 1, dtype=np.uint8, gcps=gcps, crs="EPSG:4326"):
-        pass
-    with rasterio.open(path) as file:
-        transform = from_gcps(file.gcps[0])
-    assert transform.almost_equals(place, precision=a_nanodegree)
 
 
 def test_only_active_points_are_written_and_qgis_has_the_others_disabled() -> None:

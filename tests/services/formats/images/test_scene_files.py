@@ -279,29 +279,6 @@ def refined(model: RpcModel) -> RpcModel:
     return fold_into_rpc(model, replace(no_correction(PIXELS.shape), parameters=parameters))
 
 
-@pytest.mark.parametrize(
-    ("sidecar", "text"),
-    [
-        ("a_RPC.TXT", format_rpc_text(CROP)),
-        ("a.RPB", format_rpb(CROP, "WV02")),
-        ("a_RPC.XML", format_dimap_rpc(V2, CROP)),
-        ("a.geom", format_geom(CROP, GEOM)),
-    ],
-)
-def test_a_refined_model_reads_back_from_every_file_it_is_written_to(
-    tmp_path: Path, sidecar: str, text: str
-) -> None:
-    path = write_image(tmp_path / "a.tif")
-    (tmp_path / sidecar).write_text(text)
-    delivered = read_rpc(path)
-    model = refined(delivered.model)
-    written = write_model(delivered, model, tmp_path / "out")
-    assert {file.name for file in written} == {"refined_RPC.TXT", sidecar}
-    for file in written:
-        assert misfit_px(read_rpc(path, file).model, model) < a_millionth_of_a_pixel
-    assert (tmp_path / sidecar).read_text() == text
-
-
 def test_the_refined_model_of_a_crop_is_in_the_pixels_of_the_crop(tmp_path: Path) -> None:
     path = write_image(tmp_path / "IMG_a.tif", placed=True)
     (tmp_path / "RPC_a.XML").write_text(V2)

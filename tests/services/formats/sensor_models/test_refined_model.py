@@ -7,10 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyogrio
 import pytest
 import rasterio
-import shapely
 from rasterio.transform import Affine
 
 from amers.services.errors import FormatError
@@ -22,8 +20,6 @@ from amers.services.formats.sensor_models.correction_json import (
 )
 from amers.services.formats.sensor_models.refined_model import Stated, write_refined
 from amers.services.formats.sensor_models.rpc_files import ImageFiles
-from amers.services.formats.vector.residual_layers import exaggeration_for, write_residual_layers
-from amers.services.geodesy import metres_per_degree_at
 from amers.services.quality.correction_accuracy import CorrectionAccuracy
 from amers.services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
 from amers.services.sensors.displacement import DisplacementGrid
@@ -223,36 +219,6 @@ def test_an_rpc_that_does_not_fit_the_model_is_refused_with_its_error() -> None:
     assert followed.model is not None
     assert followed.max_error_px < REFIT_LIMIT_PX < 0.1 < refused.max_error_px
     assert refused.model is None
-
-
-@pytest.mark.long
-def test_residual_vectors_open_in_a_gis_with_heights_and_reference_system(
-    registered, tmp_path: Path
-) -> None:
-    measures = registered().measures
-    path = tmp_path / "residuals.gpkg"
-    exaggeration = exaggeration_for(measures)
-    for _ in range(2):
-        write_residual_layers(path, measures, "scene", exaggeration)
-    assert {name for name, _ in pyogrio.list_layers(path)} == {
-        "held_area",
-        "residuals",
-        "control_points",
-        "layer_styles",
-    }
-    meta, _, geometry, values = pyogrio.raw.read(path, layer="residuals")
-    assert meta["crs"] == "EPSG:4979"
-    fields = dict(zip(meta["fields"], values, strict=True))
-    ends = shapely.get_coordinates(shapely.from_wkb(geometry), include_z=True).reshape(-1, 2, 3)
-    matched = measures.matched
-    np.testing.assert_array_equal(ends[:, 0], measures.lon_lat_h[matched])
-    np.testing.assert_array_equal(ends[:, 1, 2], measures.lon_lat_h[matched, 2])
-    drawn_m = (ends[:, 1] - ends[:, 0])[:, :2] * metres_per_degree_at(ends[:, 0]) / exaggeration
-    np.testing.assert_allclose(drawn_m, measures.residual_m[matched], atol=A_MICROMETRE)
-    assert set(fields["exaggeration"]) == {exaggeration}
-    assert set(fields["status"]) <= {"active", "deactivated"}
-    points = pyogrio.read_info(path, layer="control_points")
-    assert (points["features"], points["geometry_type"]) == (len(measures.point_id), "Point Z")
 
 
 def test_the_refined_model_of_an_ortho_scene_is_its_map_grid(registered, tmp_path: Path) -> None:
