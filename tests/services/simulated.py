@@ -1,11 +1,13 @@
 """Small simulated worlds, views, blocks and productions, each computed once for all tests."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
 
 import numpy as np
 
+from amers.services.adjustment.intersection import Intersection, intersect
 from amers.services.production.image_production import Production, ProductionOptions, produce_points
 from amers.services.simulation.view import (
     SimulatedView,
@@ -17,7 +19,7 @@ from amers.services.simulation.view import (
 )
 from amers.services.simulation.world import World, make_world
 from amers.services.tasks import Work
-from amers.services.types import ChipArray, ControlPoints
+from amers.services.types import ChipArray, ControlPoints, Observations
 
 SHAPE = (700, 700)
 GSD_M = 1.0
@@ -31,21 +33,18 @@ def world(seed: int = 1) -> World:
     return make_world(np.random.default_rng(seed), size_m=1000.0, posting_m=1.0)
 
 
+def views_of(
+    ground: World, rng: np.random.Generator, count: int = 3, error_m: float = BLOCK_SIGMA_M
+) -> tuple[SimulatedView, ...]:
+    """Views of the middle of a world from all sides."""
+    common = {"shape": SHAPE, "gsd_m": GSD_M, "largest_incidence_deg": 20.0}
+    return tuple(simulate_block(ground, rng, n_views=count, error_m=error_m, **common))  # type: ignore[arg-type]
+
+
 @cache
 def block_views() -> tuple[SimulatedView, ...]:
     """Three views of the middle of the world, each with an error of about 3 m."""
-    rng = np.random.default_rng(2)
-    return tuple(
-        simulate_block(
-            world(),
-            rng,
-            n_views=3,
-            shape=SHAPE,
-            gsd_m=GSD_M,
-            error_m=BLOCK_SIGMA_M,
-            largest_incidence_deg=20.0,
-        )
-    )
+    return views_of(world(), np.random.default_rng(2))
 
 
 @cache
@@ -58,6 +57,15 @@ def production_with_work() -> tuple[Production, Work]:
 def production() -> Production:
     """The points produced from the three views."""
     return production_with_work()[0]
+
+
+def truth_of(made: Production, views: Sequence[SimulatedView]) -> Intersection:
+    """Positions by the true models of the details that the adjusted models project the points to."""
+    n, count = len(made.points), len(views)
+    seen = np.stack([model.project(made.points.lon_lat_h) for model in made.adjustment.models], axis=1)
+    point, image = np.repeat(np.arange(n), count), np.tile(np.arange(count), n)
+    observations = Observations(point, image, seen.reshape(-1, 2), np.full(n * count, 0.1))
+    return intersect([view.geometry.true_model for view in views], observations, n)
 
 
 @dataclass(frozen=True)

@@ -4,14 +4,13 @@ from functools import cache
 
 import numpy as np
 
-from amers.services.adjustment.intersection import intersect
 from amers.services.imagery.scene import Scene
 from amers.services.production.control import Control
 from amers.services.production.image_production import Production, produce_points
-from amers.services.simulation.view import SimulatedView, simulate_block
+from amers.services.simulation.view import SimulatedView
 from amers.services.tasks import Work
-from amers.services.types import Array, Observations
-from tests.services.simulated import GSD_M, OPTIONS, SHAPE, world
+from amers.services.types import Array
+from tests.services.simulated import OPTIONS, truth_of, views_of, world
 from tests.services.ties import difference_m
 
 SIGMA_M = 5.0
@@ -21,18 +20,7 @@ CHI2_3 = 11.3
 
 @cache
 def views(seed: int, error_m: float = SIGMA_M) -> tuple[SimulatedView, ...]:
-    rng = np.random.default_rng(seed)
-    return tuple(
-        simulate_block(
-            world(),
-            rng,
-            n_views=3,
-            shape=SHAPE,
-            gsd_m=GSD_M,
-            error_m=error_m,
-            largest_incidence_deg=20.0,
-        )
-    )
+    return views_of(world(), np.random.default_rng(seed), error_m=error_m)
 
 
 def scenes(seed: int) -> list[Scene]:
@@ -61,15 +49,4 @@ def placed(seed: int, control: Control) -> Production:
 
 def frame_error_m(made: Production, seen: tuple[SimulatedView, ...]) -> Array:
     """Mean error (3,) on the Earth of the points: the true ground of what the images show there."""
-    n, count = len(made.points), len(made.adjustment.models)
-    seen_at = np.stack(
-        [model.project(made.points.lon_lat_h) for model in made.adjustment.models], axis=1
-    )
-    observations = Observations(
-        np.repeat(np.arange(n), count),
-        np.tile(np.arange(count), n),
-        seen_at.reshape(-1, 2),
-        np.full(n * count, 0.1),
-    )
-    truth = intersect([view.geometry.true_model for view in seen], observations, n)
-    return difference_m(made.points.lon_lat_h, truth.lon_lat_h).mean(axis=0)
+    return difference_m(made.points.lon_lat_h, truth_of(made, seen).lon_lat_h).mean(axis=0)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from amers.services.adjustment.intersection import Intersection, intersect
+from amers.services.adjustment.intersection import Intersection
 from amers.services.conventions import CHIP_CENTRE, CHIP_SIZE
 from amers.services.errors import ComputationError, InputError, NotEnoughPoints
 from amers.services.imagery.scene import Scene
@@ -14,7 +14,7 @@ from amers.services.matching.multi_image import stored_chip
 from amers.services.production.image_production import Production, ProductionOptions, produce_points
 from amers.services.simulation.view import plan_geometry
 from amers.services.tasks import Work
-from amers.services.types import Array, BoolArray, Observations
+from amers.services.types import Array, BoolArray
 from tests.services.simulated import (
     BLOCK_SIGMA_M,
     OPTIONS,
@@ -23,6 +23,7 @@ from tests.services.simulated import (
     plan,
     production,
     production_with_work,
+    truth_of,
     world,
 )
 from tests.services.ties import difference_m
@@ -43,16 +44,7 @@ def made() -> Production:
 
 @pytest.fixture(scope="module")
 def true_points(made: Production) -> Intersection:
-    """Positions by the true models of the details that the adjusted models project the points to."""
-    n, count = len(made.points), len(made.adjustment.models)
-    seen = np.stack([model.project(made.points.lon_lat_h) for model in made.adjustment.models], axis=1)
-    observations = Observations(
-        np.repeat(np.arange(n), count),
-        np.tile(np.arange(count), n),
-        seen.reshape(-1, 2),
-        np.full(n * count, a_tenth_of_a_pixel),
-    )
-    return intersect([view.geometry.true_model for view in block_views()], observations, n)
+    return truth_of(made, block_views())
 
 
 def scenes() -> list[Scene]:

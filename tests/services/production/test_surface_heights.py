@@ -20,18 +20,18 @@ from amers.services.matching.ground_features import FeatureOptions
 from amers.services.production.image_production import Production, ProductionOptions, produce_points
 from amers.services.production.point_surfaces import NOT_ASKED, surfaces_at
 from amers.services.production.tie_points import find_tie_points
-from amers.services.simulation.view import SimulatedView, ViewPlan, simulate_block, simulate_view
+from amers.services.simulation.view import SimulatedView, ViewPlan, simulate_view
 from amers.services.simulation.world import World, make_world
 from amers.services.surface.match import REASON_LABELS, Reason
 from amers.services.tasks import Work
-from amers.services.types import Array, Observations, no_progress
+from amers.services.types import Array, no_progress
 from tests.services.simulated import (
     BLOCK_SIGMA_M,
-    GSD_M,
     OPTIONS,
-    SHAPE,
     block_views,
     production,
+    truth_of,
+    views_of,
     world,
 )
 
@@ -72,16 +72,7 @@ def simulated_surfaces(ground: World, views: Sequence[SimulatedView], made: Prod
 
     The block differs from the truth by a translation.
     """
-    points = made.points
-    n, count = len(points), len(views)
-    seen = np.stack([model.project(points.lon_lat_h) for model in made.adjustment.models], axis=1)
-    observations = Observations(
-        np.repeat(np.arange(n), count),
-        np.tile(np.arange(count), n),
-        seen.reshape(-1, 2),
-        np.full(n * count, 0.1),
-    )
-    true = intersect([v.geometry.true_model for v in views], observations, n).lon_lat_h
+    points, true = made.points, truth_of(made, views).lon_lat_h
     above = ground.surface_m(true[:, :2]) - true[:, 2]
     assert points.surface is not None
     stated = points.surface.height_m - points.lon_lat_h[:, 2]
@@ -97,15 +88,7 @@ def simulated_surfaces(ground: World, views: Sequence[SimulatedView], made: Prod
 def surfaces_of(seed: int, views: int) -> Surfaces:
     """Many points of a world that no other test uses."""
     ground = world(seed)
-    seen = simulate_block(
-        ground,
-        np.random.default_rng(seed + 1),
-        n_views=views,
-        shape=SHAPE,
-        gsd_m=GSD_M,
-        error_m=BLOCK_SIGMA_M,
-        largest_incidence_deg=20.0,
-    )
+    seen = views_of(ground, np.random.default_rng(seed + 1), views)
     made = produce_points(
         [view.as_scene(BLOCK_SIGMA_M) for view in seen], replace(OPTIONS, points=150, surface_pairs=10)
     )
@@ -141,12 +124,7 @@ def test_surfaces_of_bent_blocks_are_as_far_from_the_truth_as_stated() -> None:
         made = produce_points([view.as_scene(5.0) for view in views], options)
         points, surface = made.points, made.points.surface
         assert surface is not None
-        seen = np.stack([model.project(points.lon_lat_h) for model in made.adjustment.models], axis=1)
-        n = len(points)
-        rays = Observations(
-            np.repeat(np.arange(n), 2), np.tile([0, 1], n), seen.reshape(-1, 2), np.full(2 * n, 0.1)
-        )
-        true = intersect([view.geometry.true_model for view in views], rays, n).lon_lat_h
+        true = truth_of(made, views).lon_lat_h
         shift = (points.lon_lat_h - true).mean(axis=0)
         error_m = surface.height_m - ground.surface_m((points.lon_lat_h - shift)[:, :2]) - shift[2]
         known = np.isfinite(error_m)

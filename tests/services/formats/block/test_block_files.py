@@ -214,44 +214,16 @@ def test_a_document_reads_back_as_it_was_written(block_text):
     assert format_block_json(parse_block_json(block_text)) == block_text
 
 
-def test_a_block_states_its_frame(tmp_path):
+def test_a_block_states_its_frame_what_its_points_share_and_what_is_assumed(tmp_path):
     covariance_m2 = np.array([[1.8, 0.2, 0.5], [0.2, 1.7, 0.0], [0.5, 0.0, 25.0]])
-    points, stated = control_points(3, np.random.default_rng(1)), Frame(covariance_m2)
+    shared_m2 = np.array([[0.1, 0.02, 0.0], [0.02, 0.2, 0.05], [0.0, 0.05, 0.4]])
+    stated = Frame(covariance_m2, shared_m2, assumed="the accuracy of two models is not stated")
+    points = control_points(3, np.random.default_rng(1))
     write_block(tmp_path / "block", replace(metadata(), frame=stated), points, noise_chips(points), {})
     (frame,) = check_block(tmp_path / "block").points.frames
     assert_array_equal(frame.covariance_m2, covariance_m2)
-
-
-def test_a_block_states_what_its_points_share(tmp_path):
-    shared_m2 = np.array([[0.1, 0.02, 0.0], [0.02, 0.2, 0.05], [0.0, 0.05, 0.4]])
-    points, stated = control_points(3, np.random.default_rng(1)), Frame(np.eye(3), shared_m2)
-    write_block(tmp_path / "block", replace(metadata(), frame=stated), points, noise_chips(points), {})
-    (frame,) = check_block(tmp_path / "block").points.frames
     assert_array_equal(frame.shared_m2, shared_m2)
-
-
-def test_a_block_says_what_its_frame_assumes(tmp_path):
-    points = control_points(3, np.random.default_rng(1))
-    stated = Frame(np.eye(3), assumed="the accuracy of two models is not stated")
-    write_block(tmp_path / "block", replace(metadata(), frame=stated), points, noise_chips(points), {})
-    (frame,) = check_block(tmp_path / "block").points.frames
     assert frame.assumed == stated.assumed
-
-
-@pytest.mark.parametrize("assumed", [7, "a" * 301, "a\nb", ["text"]])
-def test_what_a_frame_assumes_is_a_sentence_or_refused(block, assumed):
-    document = json.loads((block.folder / "block.json").read_text())
-    document["amers:frame"] = {"covariance_m2": np.eye(3).tolist(), "assumed": assumed}
-    with pytest.raises(FormatError, match="amers:frame: assumed"):
-        parse_block_json(json.dumps(document))
-
-
-@pytest.mark.parametrize("shared_m2", [[[1.0]], "0.1 m", [[1, 0, 0], [0, None, 0], [0, 0, 1]], -1])
-def test_what_points_share_is_a_covariance_or_refused(block, shared_m2):
-    document = json.loads((block.folder / "block.json").read_text())
-    document["amers:frame"] = {"covariance_m2": np.eye(3).tolist(), "shared_m2": shared_m2}
-    with pytest.raises(FormatError, match="amers:frame: shared_m2"):
-        parse_block_json(json.dumps(document))
 
 
 def test_a_frame_is_unknown_where_nothing_or_null_is_stated(block):
@@ -274,20 +246,32 @@ def test_a_block_that_states_a_sigma_only_leaves_the_height_of_its_frame_unknown
     assert_array_equal(again.metadata.frame.covariance_m2, read.metadata.frame.covariance_m2)
 
 
+NO_COVARIANCES = [
+    [[1.0, 0.0], [0.0, 1.0]],
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]],
+    [[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+    [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, None]],
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, "high"]],
+    7,
+]
+
+
 @pytest.mark.parametrize(
-    "covariance_m2",
+    ("name", "value"),
     [
-        [[1.0, 0.0], [0.0, 1.0]],
-        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]],
-        [[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
-        [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
-        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, None]],
-        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, "high"]],
-        7,
+        *(("covariance_m2", value) for value in NO_COVARIANCES),
+        *(
+            ("shared_m2", value)
+            for value in ([[1.0]], "0.1 m", [[1, 0, 0], [0, None, 0], [0, 0, 1]], -1)
+        ),
+        *(("assumed", value) for value in (7, "a" * 301, "a\nb", ["text"])),
     ],
 )
-def test_a_frame_that_is_no_covariance_is_refused(block, covariance_m2):
-    document = json.loads((block.folder / "block.json").read_text())
-    document["amers:frame"] = {"covariance_m2": covariance_m2}
-    with pytest.raises(FormatError, match="amers:frame"):
+def test_a_frame_is_of_covariances_and_a_sentence_or_refused_by_its_member(block_text, name, value):
+    document = json.loads(block_text)
+    document["amers:frame"] = {"covariance_m2": np.eye(3).tolist(), name: value}
+    with pytest.raises(
+        FormatError, match="amers:frame" if name == "covariance_m2" else f"amers:frame: {name}"
+    ):
         parse_block_json(json.dumps(document))
