@@ -80,10 +80,6 @@ def test_statistics_are_those_of_the_finite_values():
     assert result.rms == pytest.approx(np.sqrt(5.0))
 
 
-def test_one_value_has_no_standard_deviation():
-    assert np.isnan(statistics(np.array([4.0])).std)
-
-
 def test_accuracy_separates_bias_from_spread_on_each_axis():
     error_m = np.array([[1.0, 2.0, -3.0], [3.0, 2.0, -5.0], [np.nan, 0.0, 0.0]])
     result = accuracy(error_m)
@@ -97,6 +93,16 @@ def test_accuracy_separates_bias_from_spread_on_each_axis():
 
 def test_planimetric_errors_say_nothing_about_heights():
     assert accuracy(np.zeros((40, 2))).le90_m is None
+
+
+def test_heights_that_groups_share_loosen_no_ce90_and_places_that_they_share_no_le90():
+    rng, group = np.random.default_rng(4), np.repeat(np.arange(10), 40)
+    own, shared = rng.normal(size=(400, 3)), 3.0 * rng.normal(size=(10, 3))[group]
+    alone, of_places, of_heights = (
+        accuracy(own + shared * columns, group) for columns in ([0, 0, 0], [1, 1, 0], [0, 0, 1])
+    )
+    assert of_places.le90_m == alone.le90_m
+    assert of_heights.ce90_m == alone.ce90_m
 
 
 def test_ce90_of_a_circular_sample_is_the_known_factor():
