@@ -239,3 +239,22 @@ def test_a_second_site_gains_what_it_adds_to_the_first() -> None:
     gained_m = first.on_the_earth.ce90_m - second.on_the_earth.ce90_m
     assert np.nanmax(second.gain_m) == pytest.approx(gained_m)
     assert 0.0 < gained_m < np.nanmax(first.gain_m)
+
+
+def test_the_order_of_images_and_groups_changes_nothing() -> None:
+    """Each image measures as well as it states, and each group lies as its own site does."""
+    away, sigmas_px = 4 * EAST_DEG, (0.1, 0.2, 0.5, 1.0)
+    images = tuple(
+        replace(one, name=f"image {k}", lon_lat=(one.lon_lat[0] + far * away, MIDDLE[1]), sigma_px=px)
+        for k, (far, one, px) in enumerate(zip((0, 0, 1, 1), strip(2) * 2, sigmas_px, strict=True))
+    )
+    loose = SiteSigmas(frame_sigma_m=(5.0, 5.0))
+    known = sites()[0], replace(sites()[4], sigmas=loose)
+    plan = BlockPlan(images, spacing_m=1500.0, sites=known)
+    found, turned = forecast(plan), forecast(replace(plan, images=images[::-1]))
+    np.testing.assert_allclose(turned.ce90_m, found.ce90_m, rtol=1e-6)
+    np.testing.assert_allclose(turned.le90_m, found.le90_m, rtol=1e-6)
+    for one, same in zip(found.images, turned.images[::-1], strict=True):
+        assert one.name == same.name
+        assert one.relative.ce90_m == pytest.approx(same.relative.ce90_m)
+        assert one.on_the_earth.le90_m == pytest.approx(same.on_the_earth.le90_m)
