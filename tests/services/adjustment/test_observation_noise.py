@@ -27,3 +27,15 @@ def test_noise_that_is_stated_in_part_is_found_for_sharp_and_for_dull_measures(
         )
     assert np.sqrt(found.scale2) == pytest.approx(times, abs=0.12)
     assert np.sqrt(found.own2_px2) == pytest.approx(own_px, abs=0.02)
+
+
+def test_each_ray_of_a_pair_counts_with_its_own_sigma_in_both_coordinates() -> None:
+    """Rays of an image that measures well, and of one that does so here and there."""
+    views, rng = ring_of_geometries(2), np.random.default_rng(13)
+    ties = make_ties(views, rng, 1500, 0.0)
+    image, sigma_px = ties.observations.image, ties.observations.sigma_px
+    sigma_px[:] = np.where(image == 0, 0.03, rng.choice([0.03, 0.1, 0.3], len(image)))
+    noise_px = sigma_px[:, None] * rng.normal(size=(len(image), 2))
+    found = found_noise(ties.observations, [view.rpc for view in views], ties.lon_lat_h, noise_px)
+    assert np.sqrt(found.scale2) == pytest.approx(1.0, abs=0.06)
+    assert np.sqrt(found.own2_px2) < 0.02
