@@ -29,6 +29,8 @@ KNOWN = 4
 """Few points place the block: each has drawn it towards itself."""
 ALL = np.ones(KNOWN, dtype=np.bool_)
 ALL_BUT_THE_FIRST = np.arange(KNOWN) > 0
+EVERYTHING, PLACE, HEIGHT = [0, 1, 2], [0, 1], [2]
+"""Coordinates of a point that are known."""
 EXACT_FRAME = Frame.from_sigmas(0.001, 0.001)
 
 
@@ -45,6 +47,13 @@ class Block:
         lon_lat_h = self.control.lon_lat_h.copy()
         lon_lat_h[:1] = move_metres(lon_lat_h[:1], off_m[None])
         return replace(self, control=replace(self.control, lon_lat_h=lon_lat_h))
+
+    def with_the_first_known(self, axes: list[int]) -> "Block":
+        """The block of whose first known point only some coordinates are known."""
+        covariance_m2 = self.control.covariance_m2.copy()
+        unknown = np.setdiff1d(EVERYTHING, axes)
+        covariance_m2[0, unknown, unknown] = np.inf
+        return replace(self, control=replace(self.control, covariance_m2=covariance_m2))
 
     def without_the_first(self) -> ControlGround:
         """The other known points."""
@@ -96,26 +105,36 @@ def block() -> Block:
     return Block(images, ties.observations, control)
 
 
-def largest_m(block: Block, axis: int) -> float:
-    """How far off the first point may be along an axis: by the block that has the others alone."""
+def largest_m(block: Block, axis: int, known: list[int]) -> float:
+    """How far off the first point may be along a known axis: by the block of the others alone."""
     others = adjust_block(block.images, block.observations, control=block.without_the_first())
     predicted_m2 = others.point_covariance_m2[0] + others.frames[0].covariance_m2
-    inverse = np.linalg.inv(predicted_m2 + block.control.covariance_m2[0])
-    towards = np.eye(3)[axis]
-    misfit_m = difference_m(block.control.lon_lat_h[:1], others.lon_lat_h[:1])[0]
+    spread_m2 = predicted_m2 + block.control.covariance_m2[0]
+    inverse = np.linalg.inv(spread_m2[np.ix_(known, known)])
+    towards = np.eye(3)[axis, known]
+    misfit_m = difference_m(block.control.lon_lat_h[:1], others.lon_lat_h[:1])[0, known]
     # (misfit + s towards)^2 = limit, for the larger s.
     a, b = towards @ inverse @ towards, towards @ inverse @ misfit_m
-    c = misfit_m @ inverse @ misfit_m - chi2.ppf(STAYS, 3)
+    c = misfit_m @ inverse @ misfit_m - chi2.ppf(STAYS, len(known))
     return float((-b + np.sqrt(b**2 - a * c)) / a)
 
 
-@pytest.mark.parametrize("shared_m", [0.001, 5.0])
-@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize(
+    ("axis", "known", "shared_m"),
+    [
+        (0, EVERYTHING, 5.0),
+        (1, EVERYTHING, 0.001),
+        (2, EVERYTHING, 5.0),
+        (1, PLACE, 5.0),
+        (2, HEIGHT, 0.001),
+    ],
+)
 def test_a_known_point_leaves_and_comes_back_where_the_others_predict_it(
-    block: Block, axis: int, shared_m: float
+    block: Block, axis: int, known: list[int], shared_m: float
 ) -> None:
     """What all known points share contradicts none of them."""
-    limit_m = largest_m(block, axis)
+    block = block.with_the_first_known(known)
+    limit_m = largest_m(block, axis, known)
     frames = (Frame.from_sigmas(shared_m, shared_m),)
     shared = replace(block, control=replace(block.control, frames=frames))
     for share, agrees in ((0.95, True), (1.05, False)):
