@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from amers.services.errors import CoverageError
+from amers.services.geodesy import move_metres
 from amers.services.misfit.control_observations import ControlObservations
 from amers.services.misfit.marked_scene import MarkedScene, MarkPriors, adjust_marks
 from amers.services.quality.normal_law import normal_ce90
@@ -131,6 +132,17 @@ def test_a_mark_left_out_is_compared_with_the_solution_of_the_others():
     used = np.arange(5) != 2
     without = adjust_marks(MODEL, SHAPE, replace(marks, usable=used), PRIORS, like=marked)
     assert without.adjustment.residual_px[2] == pytest.approx(marked.left_out_px[2], abs=1e-9)
+
+
+@pytest.mark.parametrize("towards", np.eye(3), ids=["east", "north", "up"])
+def test_ground_that_is_off_along_an_axis_moves_lines_and_samples_as_the_model_does(towards):
+    rng = np.random.default_rng(1)
+    marks = marks_of(rng, 5, of_survey_m, truth(rng))
+    off_m = np.tile(of_a_map_m * towards, (5, 1))
+    vague = replace(marks, covariance_m2=off_m[:, :, None] * off_m[:, None, :])
+    moved_px = MODEL.project(move_metres(marks.lon_lat_h, off_m)) - MODEL.project(marks.lon_lat_h)
+    stated_px = adjust_marks(MODEL, SHAPE, vague, PRIORS).adjustment.point_sigma_px
+    assert stated_px == pytest.approx(np.sqrt((moved_px**2).mean(axis=0)), rel=0.01, abs=1e-3)
 
 
 def test_marks_of_other_ground_are_refused():

@@ -6,11 +6,13 @@ from functools import cache
 import numpy as np
 import pytest
 
+from amers.services.quality.marks import marks_beside_points
 from amers.services.registration.on_points import Registration, register_scene
 from amers.services.registration.on_reference import register_on_reference
 from amers.services.registration.options import RegistrationOptions
 from amers.services.registration.scene_marks import SceneMarks
-from amers.services.types import ControlPoints, Frame
+from amers.services.types import Array, ControlPoints, Frame
+from tests.services.conftest import register
 from tests.services.registration.test_on_points import per_degree
 from tests.services.registration.test_on_reference import REFERENCE_OPTIONS, reference
 from tests.services.simulated import block, spoiled_view, world
@@ -90,6 +92,19 @@ def test_a_wrong_mark_is_rejected_by_name() -> None:
     assert [mark.name for mark in both.marks.marks if mark.status == "rejected"] == ["GCP1"]
     assert "Mark GCP1 is not used" in both.marks.words[0]
     assert off_m(both) < 0.8
+
+
+def test_a_mark_is_stated_as_uncertain_in_the_image_as_its_ground_is_along_each_axis() -> None:
+    """Seen from above in pixels of half a metre: east moves samples, north lines, and height nothing."""
+    scene = register().adjusted()
+
+    def variance_px2(sigma_m: tuple[float, ...]) -> Array:
+        report = marks_beside_points(scene, ("A", "B"), np.tile(sigma_m, (2, 1)))
+        return np.array([mark.left_out_sigma_px for mark in report.marks]) ** 2
+
+    exact = variance_px2((0.0, 0.0, 0.0))
+    for sigma_m, moved_px in (((3, 0, 0), [0, 6]), ((0, 3, 0), [6, 0]), ((0, 0, 3), [0, 0])):
+        np.testing.assert_allclose(variance_px2(sigma_m) - exact, [np.square(moved_px)] * 2, atol=0.2)
 
 
 def test_marks_are_added_to_the_places_of_a_reference() -> None:
