@@ -613,8 +613,16 @@ def test_overlapping_chips_share_noise_over_the_area_of_one_of_them() -> None:
     shared = overlap_correlation(place, side_px, np.ones(len(away)))[0]
     area_px2 = float((shared * 2.0 * np.pi * away).sum() * step_px)
     assert area_px2 == pytest.approx(side_px**2, rel=0.01)
-    half = overlap_correlation(place, side_px, np.full(len(away), 0.5))[0]
-    np.testing.assert_allclose(half[1:], 0.5 * shared[1:], atol=1e-12)
+
+
+def test_measures_of_which_little_is_their_own_share_as_little_with_others() -> None:
+    """The variance of a sum of measures is never below 0, and no order of them changes it."""
+    rng = np.random.default_rng(23)
+    place, own = rng.uniform(0.0, 100.0, (30, 2)), rng.uniform(0.05, 1.0, 30)
+    alone = overlap_correlation(place, 40.0, np.ones(30)) - np.eye(30)
+    shared = overlap_correlation(place, 40.0, own) - np.eye(30)
+    assert shared.max() > 0.3
+    np.testing.assert_allclose(shared, np.diag(own) ** 0.5 @ alone @ np.diag(own) ** 0.5, atol=1e-12)
 
 
 @pytest.mark.parametrize("shift_px", [0.0, 12_000.0])
