@@ -149,3 +149,32 @@ def test_a_point_is_as_uncertain_as_the_model_and_its_worse_coordinate_together(
         wrong = replace(points, covariance_m2=np.tile(np.diag(sigmas_m) ** 2, (len(points), 1, 1)))
         stated_m = initial_prediction(scene, wrong).uncertainty_m
         np.testing.assert_allclose(stated_m, np.hypot(SIGMA_M, 80.0))
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_scene_shows_a_chip_where_it_has_its_corners_also_with_pixels_that_are_no_squares(
+    axis: int,
+) -> None:
+    """Pixels that are twice as long along one axis, of which the image has half as many."""
+    square, times = small_scene(), np.where(np.arange(2) == axis, 0.5, 1.0)
+    lines, samples = (int(size) for size in SIZE_PX * times)
+    frame = no_correction((lines, samples))
+    slopes = np.diag((times - 1.0) * frame.half_size)
+    parameters = np.column_stack([(times - 1.0) * frame.centre, slopes])
+    longer = replace(
+        square,
+        image=ArrayImage(np.zeros((lines, samples), dtype=np.float32)),
+        model=CorrectedModel(square.model, replace(frame, parameters=parameters)),
+    )
+    lattice = np.stack(np.meshgrid(*[np.arange(3.0, SIZE_PX, 9.0)] * 2), axis=-1).reshape(-1, 2)
+    points = block()[0].take(np.zeros(len(lattice), dtype=np.int64))
+    points = replace(points, lon_lat_h=square.model.locate(lattice, points.lon_lat_h[:, 2]))
+    inside_px = np.full(len(lattice), np.inf)
+    for corner in ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)):
+        step = np.tile([*(CHIP_CENTRE * np.array(corner)), 0.0], (len(lattice), 1))
+        at = longer.model.project(move_metres(points.lon_lat_h, step))
+        inside_px = np.minimum(inside_px, np.minimum(at, [lines - 1, samples - 1] - at).min(axis=1))
+    clear = np.abs(inside_px) > 1.0
+    shown = visibility_probability(longer, points, prediction_within(1e-6, longer, points), 1.0)
+    np.testing.assert_allclose(shown[clear], inside_px[clear] > 0.0, atol=1e-6)
+    assert 100 < (inside_px > 0.0).sum() < 0.9 * len(lattice)
