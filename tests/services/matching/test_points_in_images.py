@@ -17,6 +17,7 @@ from amers.services.matching.multi_image import (
     refine_on_chips,
     seen_whole,
 )
+from amers.services.registration.rescaled import rescaled_scene
 from amers.services.types import Array, FloatImage
 from tests.services.registration.small_ground import GSD_M, scene, whole
 from tests.services.textures import as_pixels, texture
@@ -76,6 +77,22 @@ def test_what_defines_a_detail_is_as_precise_as_the_best_of_the_others() -> None
         assert sigma_px[1] == pytest.approx(min(sigma_px[0], sigma_px[2]), rel=1e-3)
     stated = [np.median(found.sigma_px[found.image == image]) for image in (0, 2)]
     assert stated[0] < stated[1], "noise of 60 and of 120"
+
+
+def test_positions_and_sigmas_are_in_pixels_of_their_own_image() -> None:
+    """The first image with pixels of half the size: both are twice as many, and the others stay."""
+    plain = images()
+    pixels = plain[0].image.read(Window(0, 0, SIDE, SIDE)).repeat(2, axis=0).repeat(2, axis=1)
+    finer = replace(rescaled_scene(plain[0], 2.0), image=ArrayImage(pixels))
+    before, after = (
+        refine_on_chips(of, ground(), GSD_M).observations for of in (plain, [finer, *plain[1:]])
+    )
+    np.testing.assert_array_equal(after.image, before.image)
+    own = before.image == 0
+    times = np.where(own, 2.0, 1.0)
+    place = before.line_sample * times[:, None] + 0.5 * own[:, None]
+    np.testing.assert_allclose(after.line_sample, place, atol=0.1)
+    np.testing.assert_allclose(after.sigma_px, before.sigma_px * times, rtol=0.1)
 
 
 def test_no_measure_is_more_precise_than_is_believed() -> None:
