@@ -14,8 +14,6 @@ from amers.services.matching.systematic_error import (
 )
 from amers.services.types import Acquisition, Array, BoolArray, Views
 
-pytestmark = pytest.mark.thorough
-
 NORTH, EAST, SOUTH = 0.0, 90.0, 180.0
 NINETY_PERCENT = 2.0 * np.log(10.0)
 """Square of the radius of the 90 % region of the plane, in units of sigma."""
@@ -93,6 +91,7 @@ def stated_and_true_px(seen: BoolArray, image_offset: Array) -> tuple[Array, Arr
     return stated, measure.mean(axis=0)
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 @pytest.mark.parametrize("dominant", [False, True])
 @pytest.mark.parametrize("images", [2, 3, 4, 6])
