@@ -1,13 +1,14 @@
 """Points and images at a simulated site with relief and buildings: the true errors are found."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from amers.services.errors import InputError
-from amers.services.geodesy import metres_per_degree_at
+from amers.services.geodesy import metres_per_degree_at, move_metres
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage, sample_image
 from amers.services.quality.planimetry import planimetric_quality
@@ -67,6 +68,7 @@ def test_images_with_a_parallax_need_a_terrain() -> None:
         image_errors(view(1, np.zeros(2)), site(), None, 8.0)
 
 
+@cache
 def vertical_ortho() -> Site:
     """A site with an ortho-image of a vertical view, which shows no walls."""
     geometry = plan("nadir", incidence_deg=0.0, shape=(1000, 1000))
@@ -78,6 +80,22 @@ def vertical_ortho() -> Site:
     image = ArrayImage(sample_image(nadir.image, seen, 1.0))
     exact = replace(reference(), image=image, sigma_m=0.1, frame=Frame.from_sigmas(0.1, 0.1))
     return Site("nadir", False, exact)
+
+
+def test_a_point_that_is_not_found_takes_nothing_from_the_others() -> None:
+    """It stands before them, and each of them declares something else."""
+    points, chips = block()
+    points = points.take(np.arange(8))
+    step = np.where(np.arange(8)[:, None] == 0, [60.0, 60.0, 0.0], 0.0)
+    own_m2 = np.arange(1.0, 9.0)[:, None, None] * np.diag([1.0, 4.0, 9.0])
+    lost = replace(points, lon_lat_h=move_metres(points.lon_lat_h, step), covariance_m2=own_m2)
+    exact = replace(lost, covariance_m2=0.0 * own_m2)
+    found, measured = (point_errors(of, chips, vertical_ortho()) for of in (lost, exact))
+    row = [np.flatnonzero((points.lon_lat_h[:, :2] == at).all(axis=1))[0] for at in found.lon_lat]
+    assert len(row) > 4
+    assert 0 not in row
+    declared_m2 = found.covariance_m2 - measured.covariance_m2
+    assert_allclose(declared_m2, own_m2[row, :2, :2], atol=1e-9)
 
 
 def test_points_of_inclined_views_lie_as_far_off_as_they_truly_do() -> None:
