@@ -18,7 +18,7 @@ from amers.services.production.ortho_production import (
     produce_ortho_points,
 )
 from amers.services.quality.planimetry import planimetric_quality
-from amers.services.quality.site_errors import POINTS, Site, SiteErrors, expected_reach_m, point_errors
+from amers.services.quality.site_errors import Site, expected_reach_m, point_errors
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.types import Acquisition, Array, ControlPoints, Frame
 from tests.services.simulated import MemoryChips
@@ -149,25 +149,6 @@ def test_check_only_sites_are_told_apart_from_control_sites() -> None:
     assert_allclose(check_only.accuracy.ce90_m.value, np.hypot(4.0, 6.0), atol=a_centimetre)
     assert np.isnan(together.accuracy.ce90_m.upper)  # two sites bound nothing
     assert "share errors" in together.accuracy.ce90_m.note
-
-
-def test_the_ortho_images_of_several_sites_err_less_together_than_one() -> None:
-    """A shift of 3 m, of a block known to 1 m, at sites whose ortho-images are known to 2 m each."""
-
-    def at(name: str) -> SiteErrors:
-        error_m = np.random.default_rng(3).normal(0.0, 0.1, (201, 2))
-        error_m += [3.0, 0.0] - np.median(error_m, axis=0)
-        covariance_m2 = np.tile(0.01 * np.eye(2), (201, 1, 1))
-        place = np.zeros((201, 2))
-        return SiteErrors(
-            name, False, POINTS, np.nan, 201, 9.0, place, error_m, covariance_m2, 4.0 * np.eye(2), ()
-        )
-
-    frame = Frame.from_sigmas(1.0, 1.0)
-    for count in (1, 2, 4):
-        quality = planimetric_quality([at(f"site {k}") for k in range(count)], "points", frame)
-        expected = 3.0**2 / (1.0 + 4.0 / count) / 2.0
-        assert_allclose(quality.normalised_frame.mean_square, expected, rtol=1e-9)
 
 
 @pytest.mark.long
