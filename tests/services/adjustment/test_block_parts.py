@@ -20,7 +20,7 @@ from amers.services.tasks import Arrays, Here, Work
 from amers.services.types import Array, BoolArray, Frame, IntArray, Observations
 from benchmarks.block_adjustment import large_block
 
-N_IMAGES, PER_IMAGE = 100, 60
+N_IMAGES, PER_IMAGE = 64, 60
 of_a_sigma = 0.01
 of_a_variance = 0.02
 """How far parts may be off one solve: sigmas of parameters, and covariances."""
@@ -33,14 +33,22 @@ def block() -> tuple[Array, list[ImageParameters], Observations, list[BoolArray]
 
 
 @pytest.fixture
-def in_parts(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Makes parts of a block that is small, and groups of its parameters, on several levels."""
+def in_parts(monkeypatch: pytest.MonkeyPatch) -> Callable[..., set[int]]:
+    """Makes parts of a block that is small, and groups of its parameters; tells the sizes of levels."""
+    level, sizes = dissection._level, set()
 
-    def make(observations: int = 700) -> None:
+    def told(of: Any, matrix: Any, *others: Any) -> Any:
+        sizes.add(matrix.shape[0])
+        return level(of, matrix, *others)
+
+    def make(observations: int = 700) -> set[int]:
+        monkeypatch.setattr(dissection, "_level", told)
         monkeypatch.setattr(block_parts, "PART_OBSERVATIONS", observations)
         monkeypatch.setattr(dissection, "GROUP_ROWS", 60)
         monkeypatch.setattr(dissection, "DIRECT_ROWS", 120)
+        monkeypatch.setattr(dissection, "_MOST_SEPARATING", 0.8)
         monkeypatch.setattr(reduced_system, "DENSE_ROWS", 60)
+        return sizes
 
     return make
 
@@ -78,6 +86,13 @@ def agree(parts: BlockAdjustment, whole: BlockAdjustment) -> None:
         np.testing.assert_array_equal(np.isnan(one), np.isnan(other))
         assert np.nanmax(off) < min(of_a_variance, rounding)
     np.testing.assert_allclose(parts.accuracy.variance(), whole.accuracy.variance(), rtol=rounding)
+    pairs = whole.accuracy.pairs
+    np.testing.assert_array_equal(parts.accuracy.pairs.other, pairs.other)
+    sigma = np.sqrt(np.diagonal(whole.accuracy.relative[pairs.start[:-1]], 0, 1, 2))
+    first = np.repeat(np.arange(len(sigma)), np.diff(pairs.start))
+    scale = sigma[first][:, :, None] * sigma[pairs.other][:, None, :]
+    off = np.abs(parts.accuracy.relative - whole.accuracy.relative)
+    assert (off <= rounding * scale).all()
     for mine, its in zip(parts.frames, whole.frames, strict=True):
         np.testing.assert_allclose(mine.covariance_m2, its.covariance_m2, rtol=1e-5, atol=1e-7)
         np.testing.assert_allclose(mine.shared_m2, its.shared_m2, rtol=1e-5, atol=1e-9)
@@ -85,37 +100,25 @@ def agree(parts: BlockAdjustment, whole: BlockAdjustment) -> None:
 
 @pytest.mark.parametrize("with_control", [False, True])
 def test_a_block_in_parts_is_that_of_one_solve(
-    block: Any, in_parts: Callable[..., None], with_control: bool
+    block: Any, in_parts: Callable[..., set[int]], with_control: bool
 ) -> None:
     truth, images, observations, passes = block
     point = np.unique(observations.point)[:: len(truth) // 12].astype(np.int64)
     control = control_of(truth, point) if with_control else NO_CONTROL
     whole = adjust_block(images, observations, control=control, passes=passes)
-    in_parts()
-    work = Work()
+    levels, work = in_parts(), Work()
     parts = adjust_block(images, observations, control=control, passes=passes, work=work)
-    assert work.effort["adjust"].tasks > 400
+    assert len(levels) > 1, "groups, and groups of what separates them"
+    assert work.effort["adjust"].tasks > 4 * N_IMAGES
     if with_control:
         assert not parts.control_active[0]
         assert parts.control_active[2:].all()
     agree(parts, whole)
 
 
-def test_every_pair_of_images_has_the_covariance_of_the_dense_inverse(
-    block: Any, in_parts: Callable[..., None]
+def test_a_pass_of_all_images_does_not_join_the_parts(
+    block: Any, in_parts: Callable[..., set[int]]
 ) -> None:
-    _, images, observations, passes = block
-    whole = adjust_block(images, observations, passes=passes)
-    in_parts()
-    parts = adjust_block(images, observations, passes=passes)
-    np.testing.assert_array_equal(parts.accuracy.pairs.other, whole.accuracy.pairs.other)
-    sigma = np.sqrt(np.diagonal(whole.accuracy.relative[whole.accuracy.pairs.start[:-1]], 0, 1, 2))
-    first = np.repeat(np.arange(len(sigma)), np.diff(whole.accuracy.pairs.start))
-    scale = sigma[first][:, :, None] * sigma[whole.accuracy.pairs.other][:, None, :]
-    assert np.abs((parts.accuracy.relative - whole.accuracy.relative) / scale).max() < rounding
-
-
-def test_a_pass_of_all_images_does_not_join_the_parts(block: Any, in_parts: Callable[..., None]) -> None:
     """Images whose time is unknown may all be of one pass."""
     _, images, observations, _ = block
     passes = [np.ones(len(images), dtype=np.bool_)]
@@ -125,7 +128,7 @@ def test_a_pass_of_all_images_does_not_join_the_parts(block: Any, in_parts: Call
 
 
 def test_an_image_without_neighbours_stays_as_delivered(
-    block: Any, in_parts: Callable[..., None]
+    block: Any, in_parts: Callable[..., set[int]]
 ) -> None:
     _, images, observations, passes = block
     alone = replace(images[0], name="alone")
@@ -151,7 +154,7 @@ def cut(observations: Observations) -> Observations:
 
 
 def test_groups_that_nothing_connects_are_refused_and_taken_with_control_of_each(
-    block: Any, in_parts: Callable[..., None]
+    block: Any, in_parts: Callable[..., set[int]]
 ) -> None:
     _, images, observations, passes = block
     apart = cut(observations)
@@ -160,7 +163,9 @@ def test_groups_that_nothing_connects_are_refused_and_taken_with_control_of_each
     ground = control_of(problem.start(), point)
     # One frame for each half, as their points are only known in their own.
     first = np.unique(apart.point, return_index=True)[1]
-    of_half = (apart.image[first[np.searchsorted(np.unique(apart.point), point)]] >= 50).astype(np.int64)
+    of_half = (
+        apart.image[first[np.searchsorted(np.unique(apart.point), point)]] >= N_IMAGES // 2
+    ).astype(np.int64)
     control = replace(
         ground,
         source=of_half,
@@ -176,7 +181,7 @@ def test_groups_that_nothing_connects_are_refused_and_taken_with_control_of_each
     agree(parts, whole)
 
 
-def test_a_block_in_parts_is_tied_to_a_neighbour(block: Any, in_parts: Callable[..., None]) -> None:
+def test_a_block_in_parts_is_tied_to_a_neighbour(block: Any, in_parts: Callable[..., set[int]]) -> None:
     _, images, observations, _ = block
     before = np.flatnonzero(np.arange(N_IMAGES) < 40)
     own = observations.take(observations.image < 40)
@@ -207,23 +212,23 @@ class Dying(Executor):
         return self.here.submit(fn, *args, **kwargs)
 
 
-@pytest.mark.parametrize("share", [0.3, 0.8])
 def test_an_interrupted_adjustment_goes_on_and_is_the_same_bit_for_bit(
-    block: Any, in_parts: Callable[..., None], share: float
+    block: Any, in_parts: Callable[..., set[int]]
 ) -> None:
     """In the robust start, and in the rounds of least squares."""
     _, images, observations, passes = block
     in_parts(2000)
     complete = Work()
     whole = adjust_block(images, observations, passes=passes, work=complete)
-    kept: dict[str, Arrays] = {}
-    tasks = int(share * complete.effort["adjust"].tasks)
-    with pytest.raises(Killed):
-        adjust_block(images, observations, passes=passes, work=Work(Dying(tasks), kept))
-    rest = Work(kept=kept)
-    again = adjust_block(images, observations, passes=passes, work=rest)
-    assert rest.effort["adjust"].tasks < complete.effort["adjust"].tasks - tasks // 2
-    same_bits(again, whole)
+    for share in (0.3, 0.8):
+        kept: dict[str, Arrays] = {}
+        tasks = int(share * complete.effort["adjust"].tasks)
+        with pytest.raises(Killed):
+            adjust_block(images, observations, passes=passes, work=Work(Dying(tasks), kept))
+        rest = Work(kept=kept)
+        again = adjust_block(images, observations, passes=passes, work=rest)
+        assert rest.effort["adjust"].tasks < complete.effort["adjust"].tasks - tasks // 2
+        same_bits(again, whole)
 
 
 def same_bits(one: BlockAdjustment, other: BlockAdjustment) -> None:
@@ -234,7 +239,7 @@ def same_bits(one: BlockAdjustment, other: BlockAdjustment) -> None:
 
 @pytest.mark.long
 def test_other_processes_make_the_same_block_bit_for_bit(
-    block: Any, in_parts: Callable[..., None]
+    block: Any, in_parts: Callable[..., set[int]]
 ) -> None:
     _, images, observations, passes = block
     in_parts(2000)
@@ -245,7 +250,7 @@ def test_other_processes_make_the_same_block_bit_for_bit(
 
 
 def test_no_part_has_more_than_its_share_and_every_observation_is_in_one(
-    block: Any, in_parts: Callable[..., None]
+    block: Any, in_parts: Callable[..., set[int]]
 ) -> None:
     _, images, observations, _ = block
     in_parts()
