@@ -115,6 +115,7 @@ def spoiled_view(
     )
 
 
+@cache
 def ring_of_geometries(
     count: int, incidence_deg: float = 15.0, shape: tuple[int, int] = (4000, 4000)
 ) -> list[ViewGeometry]:
