@@ -269,14 +269,6 @@ def test_too_few_measures_are_refused_with_their_numbers(usable: int, minimum: i
     assert (caught.value.found, caught.value.needed) == (usable, minimum)
 
 
-def test_the_same_measures_give_the_same_adjustment() -> None:
-    rng = np.random.default_rng(13)
-    points = with_blunders(seen(TRUTH["affine"], rng), 6, rng)
-    first, again = points.adjust(), points.adjust()
-    np.testing.assert_array_equal(first.correction.parameters, again.correction.parameters)
-    np.testing.assert_array_equal(first.active, again.active)
-
-
 def test_the_order_of_the_points_does_not_matter() -> None:
     rng = np.random.default_rng(14)
     points = with_blunders(seen(TRUTH["shift"], rng), 6, rng)

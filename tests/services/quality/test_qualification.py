@@ -10,7 +10,7 @@ import shapely
 
 from amers.services.errors import NotEnoughPoints
 from amers.services.quality.cell_stability import measure_cell_stability
-from amers.services.quality.criteria import verdict_of, verdict_scope
+from amers.services.quality.criteria import verdict_scope
 from amers.services.quality.held_area import TriedPoints, held_area
 from amers.services.quality.normal_law import CIRCULAR_CE90
 from amers.services.quality.predicted import predict_accuracy
@@ -257,11 +257,12 @@ def test_the_place_that_moves_most_when_points_are_held_out_counts(
 ) -> None:
     scene = registered().adjusted()
     stability = measure_stability(scene, 5, 0.8, np.random.default_rng(1))
+    of_cells = measure_cell_stability(scene)
     still = [replace(one, median_px=0.01) for one in stability.displacements]
     for place in range(5):
         moved = (*still[:place], replace(still[place], median_px=9.0), *still[place + 1 :])
         shown = replace(stability, displacements=moved)
-        result = qualify_repeated(scene, DEFAULT, shown, measure_cell_stability(scene))
+        result = qualify_repeated(scene, DEFAULT, shown, of_cells)
         values = {one.value for one in result.criteria if one.name == "displacement_px"}
         assert values == {9.0}
 
@@ -317,9 +318,9 @@ def test_of_many_points_that_scatter_most_must_agree_too(registered: Callable[..
     """Where many are left out of points that hardly agree, those left may agree by chance."""
     few_agree = registered(n=90, lost=0, wrong=35, noise_px=1.5)
     assert ("active_of_matched", "usable") in failed(qualified(few_agree))
-    most_agree = registered(n=90, lost=0, wrong=10, noise_px=1.5)
-    assert ("residual_std_px", "good") in failed(qualified(most_agree))
-    assert ("active_of_matched", "usable") not in failed(qualified(most_agree))
+    most_agree = failed(qualified(registered(n=90, lost=0, wrong=10, noise_px=1.5)))
+    assert ("residual_std_px", "good") in most_agree
+    assert ("active_of_matched", "usable") not in most_agree
 
 
 def test_what_points_of_three_metres_are_known_to_give_is_good(registered):
@@ -397,14 +398,6 @@ def test_points_worse_than_stated_make_a_scene_usable_that_says_so(registered, s
     assert np.hypot(*error_px[0]) < 3.0 * result.predicted.overall_px
 
 
-def test_worse_points_do_not_explain_a_bend_of_the_model(registered):
-    """What neighbours share is no error of theirs, however much worse than stated they look."""
-    measures = registered(n=300, lost=0, wrong=0).measures
-    wave_px = 4.0 * np.sin(measures.line_sample / 500.0)
-    bent = replace(measures, active=np.ones(300, dtype=bool), residual_px=wave_px)
-    assert unexplained_px(bent, np.full(2, 4.0 * 0.5)) > 2.0
-
-
 def test_few_points_of_which_many_disagree_are_not_usable(registered):
     few = registered(n=18, lost=0, wrong=0)
     disagreeing = replace(few.measures, active=np.arange(18) < 10)
@@ -468,11 +461,6 @@ def test_a_criterion_without_a_value_is_not_met(registered):
     result = qualified(replace(registered(), adjustment=unknown))
     assert failed(result) == {("predicted_ce90_px", "good"), ("predicted_ce90_px", "usable")}
     assert result.verdict == "failed"
-
-
-def test_the_verdict_is_recomputed_from_the_criteria_alone(registered):
-    result = qualified(registered(n=30))
-    assert verdict_of(result.criteria) == result.verdict
 
 
 def test_the_same_seed_gives_the_same_figures(registered):
