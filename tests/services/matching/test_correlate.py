@@ -109,8 +109,7 @@ def test_the_stated_sigma_is_honest_for_any_smoothness_of_the_noise(
     assert 0.7 < outcome.normalised_square < 1.5
 
 
-@pytest.mark.parametrize("smoothness_px", [1.0, 2.5, 4.0])
-@pytest.mark.parametrize("side", [41, SIDE])
+@pytest.mark.parametrize(("side", "smoothness_px"), [(41, 1.0), (41, 2.5), (41, 4.0), (SIDE, 4.0)])
 @pytest.mark.long
 def test_the_stated_sigma_is_honest_where_noise_is_smooth_over_several_squares(
     side: int, smoothness_px: float

@@ -1,6 +1,7 @@
 """Shadows that differ under another sun do not displace a chip."""
 
 from dataclasses import replace
+from functools import cache
 from math import radians, tan
 
 import numpy as np
@@ -32,6 +33,7 @@ remaining_bias = 0.5
 a_twentieth_of_a_pixel = 0.05
 
 
+@cache
 def village(seed: int, image: Acquisition) -> FloatImage:
     """Houses of 6 to 10 m on grass with the shadows of an acquisition, rendered on a finer grid."""
     rng = np.random.default_rng(seed)
