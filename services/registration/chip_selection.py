@@ -59,7 +59,11 @@ def visibility_probability(
         cut_px: (2,) lines and samples at each border of the scene that do not count.
     """
     line_sample = prediction.model.project(points.lon_lat_h)
-    middle = points.lon_lat_h[len(points) // 2 : len(points) // 2 + 1]
+    # Models have no position for ground far away from their image.
+    placed = np.flatnonzero(np.isfinite(line_sample).all(axis=1))
+    if not len(placed):
+        return np.zeros(len(points))
+    middle = points.lon_lat_h[placed[len(placed) // 2]][None]
     derivative = np.abs(scene.model.project_derivative(middle)[0, :, :2])
     reach_px = share * CHIP_CENTRE * gsd_m * derivative.sum(axis=1) + cut_px
     sigma_px = np.maximum(prediction.uncertainty_m / scene_gsd_m(scene), _MIN_SIGMA_PX)[:, None]

@@ -178,3 +178,19 @@ def test_a_scene_shows_a_chip_where_it_has_its_corners_also_with_pixels_that_are
     shown = visibility_probability(longer, points, prediction_within(1e-6, longer, points), 1.0)
     np.testing.assert_allclose(shown[clear], inside_px[clear] > 0.0, atol=1e-6)
     assert 100 < (inside_px > 0.0).sum() < 0.9 * len(lattice)
+
+
+def test_points_for_which_the_model_has_no_position_change_nothing_for_the_others() -> None:
+    """Wherever they stand among them, also in the middle, or alone."""
+    scene, points = small_scene(), block()[0]
+    away = replace(points, lon_lat_h=points.lon_lat_h + [40.0, 0.0, 0.0])
+    assert np.isnan(scene.model.project(away.lon_lat_h)).all()
+    lost = 3 * np.arange(len(points)) // len(points) == 1
+    mixed = replace(points, lon_lat_h=np.where(lost[:, None], away.lon_lat_h, points.lon_lat_h))
+    known, some, none = (
+        visibility_probability(scene, of, prediction_within(SIGMA_M, scene, of), 1.0)
+        for of in (points, mixed, away)
+    )
+    assert known[~lost].max() > 0.1
+    np.testing.assert_allclose(some, np.where(lost, 0.0, known), atol=2e-3)
+    assert not none.any()
