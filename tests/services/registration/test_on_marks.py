@@ -70,7 +70,7 @@ def test_the_mark_that_it_asks_for_brings_what_it_states():
     place = np.array([[promised.line, promised.sample]])
     nine = register_on_marks(SCENE, marks_at(np.concatenate([eight(), place])))
     assert nine.qualification.predicted.worst_m == pytest.approx(promised.ce90_m, rel=0.01)
-    for other in eight(seed=1):
+    for other in eight(seed=1)[:4]:
         elsewhere = register_on_marks(SCENE, marks_at(np.concatenate([eight(), other[None]])))
         assert elsewhere.qualification.predicted.worst_m >= 0.999 * promised.ce90_m
     shown = registration.model.project(np.array([[promised.lon, promised.lat, 100.0]]))
