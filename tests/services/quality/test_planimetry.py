@@ -119,17 +119,6 @@ def test_the_errors_of_the_points_are_found_at_a_site() -> None:
 
 
 @pytest.mark.long
-def test_points_that_declare_too_little_are_told_so() -> None:
-    points, chips = block()
-    error_m = np.random.default_rng(6).normal(0.0, POINT_SIGMA_M, (len(points), 2))
-    boasting = replace(misplaced(points, error_m), covariance_m2=points.covariance_m2 / 16.0)
-    errors = point_errors(boasting, chips, site("west", *WEST))
-    quality = planimetric_quality([errors], "points", points.frames[0])
-    assert quality.normalised.mean_square > quality.normalised.upper
-    assert quality.typical_ratio > 2.0
-
-
-@pytest.mark.long
 def test_check_only_sites_are_told_apart_from_control_sites() -> None:
     points, chips = block()
     sites = [
