@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from uuid import uuid4
 
+import httpx
 import psycopg
 import pytest
 from fastapi.testclient import TestClient
@@ -118,7 +119,19 @@ def connection(dsn: str) -> Iterator[Connection]:
 def client(settings: Settings) -> Iterator[TestClient]:
     """The application, started, without a token; unexpected errors are replies, as for a real caller."""
     with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+        client.event_hooks = {"response": [refuse_shared_caches]}
         yield client
+
+
+def refuse_shared_caches(reply: httpx.Response) -> None:
+    """Nothing that a token opens may stay in a cache that people share, whatever a test asks for.
+
+    The files of the map page are for everybody.
+    """
+    if "authorization" in reply.request.headers and not reply.url.path.startswith("/map"):
+        directives = {one.strip().lower() for one in reply.headers["cache-control"].split(",")}
+        assert directives & {"no-store", "private"}, (reply.url, directives)
+        assert not any(one.startswith(("public", "s-maxage")) for one in directives), reply.url
 
 
 @pytest.fixture
