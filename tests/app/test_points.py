@@ -24,7 +24,8 @@ from amers.app.db.points import POINTS, points_of_block
 from amers.app.errors import InputError
 from amers.app.usecases import history
 from amers.app.usecases.blocks import lifecycle
-from amers.app.usecases.features import points
+from amers.app.usecases.features import items, points
+from amers.app.usecases.features import query as queries
 from amers.app.usecases.features.items import COLLECTIONS, everything_in
 from amers.app.usecases.features.query import FeatureQuery, condition_of
 from amers.services.geodesy import east_north_up
@@ -78,16 +79,28 @@ def test_points_of_a_box_are_a_valid_feature_collection(made, get):
     assert kinds == {"crossroads", "building corner", 'a "rare" kind', None}
 
 
-def test_pages_follow_each_other_without_gap_or_repetition(made, get):
-    seen, url, pages = [], f"{ITEMS}?limit=17", 0
-    while url:
-        page = get(url).json()
-        seen += [feature["id"] for feature in page["features"]]
-        url = next((link["href"] for link in page["links"] if link["rel"] == "next"), None)
-        pages += 1
-        assert page["numberMatched"] == 60
-    assert pages == 4
-    assert seen == (2**26 + np.arange(60)).tolist()
+@pytest.mark.parametrize("largest_text", [2_000, 5], ids=["one text", "streamed"])
+def test_pages_follow_each_other_without_gap_or_repetition(made, get, monkeypatch, largest_text):
+    """A page is one text, or streamed seven points at once; one that ends with them is the last."""
+    monkeypatch.setattr(items, "LARGEST_TEXT", largest_text)
+    monkeypatch.setattr(features, "ROWS_AT_ONCE", 7)
+    whole = "bbox=5,43,6,44&limit=60"
+    for query, expected in (
+        ("limit=17", 4),
+        ("limit=14", 5),
+        ("limit=20", 3),
+        (whole, 1),
+        ("limit=60", 1),
+    ):
+        seen, url, pages = [], f"{ITEMS}?{query}", 0
+        while url:
+            page = get(url).json()
+            seen += [feature["id"] for feature in page["features"]]
+            url = next((link["href"] for link in page["links"] if link["rel"] == "next"), None)
+            pages += 1
+            assert page["numberMatched"] == 60
+        assert pages == expected
+        assert seen == (2**26 + np.arange(60)).tolist()
 
 
 @pytest.mark.parametrize("limit", [1, 6, 7, 8, 16, 17])
@@ -141,15 +154,10 @@ def test_a_property_has_the_unit_that_its_name_ends_with_and_no_other(collection
         assert item.unit == expected, name
 
 
-def test_a_page_with_exactly_all_points_has_no_next(made, get):
-    for query in ("limit=60", "limit=60&bbox=5,43,6,44"):
-        page = get(f"{ITEMS}?{query}").json()
-        assert page["numberReturned"] == 60
-        assert "next" not in [link["rel"] for link in page["links"]]
-
-
-def test_a_limit_above_the_largest_gives_the_largest(made, get):
-    assert get(f"{ITEMS}?limit=1000000").json()["numberReturned"] == 60
+def test_a_limit_above_the_largest_gives_the_largest(made, get, monkeypatch):
+    monkeypatch.setattr(queries, "MOST_FEATURES", 40)
+    returned = [get(f"{ITEMS}?limit={limit}").json()["numberReturned"] for limit in (39, 40, 41, 10**6)]
+    assert returned == [39, 40, 40, 40]
 
 
 def test_a_limit_that_is_no_positive_number_is_refused(made, get):
@@ -211,6 +219,15 @@ def test_a_page_token_of_another_query_is_refused(made, get):
         reply = get(other)
         assert reply.status_code == 400
         assert "does not belong to this query" in reply.json()["detail"]
+
+
+def test_as_many_points_as_are_counted_exactly_are_and_of_one_more_the_number_is_estimated(
+    made, get, monkeypatch
+):
+    monkeypatch.setattr(counts, "EXACT_COUNT", 40)
+    pages = [get(f"{ITEMS}?limit=1&filter=id < {2**26 + number}").json() for number in (39, 40, 41)]
+    assert [page["numberMatched"] for page in pages[:2]] == [39, 40]
+    assert [page["amers:numberMatchedIsExact"] for page in pages] == [True, True, False]
 
 
 @pytest.mark.thorough
@@ -340,18 +357,6 @@ def test_an_unknown_view_and_an_unknown_format_are_refused(made, get):
     assert get(f"{ITEMS}/{2**26 + 7}/chips/-1").status_code == 404
     assert get(f"{ITEMS}/{2**26 + 7}/chips?f=gif").status_code == 400
     assert get(f"{ITEMS}/{2**26 + 7}/chips/0?f=gif").status_code == 400
-
-
-def test_points_are_closed_without_a_token(made, client):
-    for path in (
-        "/collections",
-        "/collections/points",
-        ITEMS,
-        f"{ITEMS}/{2**26}",
-        f"{ITEMS}/{2**26}/chips",
-    ):
-        assert client.get(path).status_code == 401
-        assert client.get(path, headers={"Authorization": "Bearer wrong"}).status_code == 401
 
 
 def test_the_collections_say_what_they_hold_and_where(made, get):

@@ -187,21 +187,6 @@ def test_an_upload_without_a_name_is_refused(client: TestClient, bearer: Bearer)
     assert "no name" in reply.json()["detail"]
 
 
-def test_uploading_needs_a_token(client: TestClient, storage: Storage):
-    for headers, status in [
-        ({}, 401),
-        ({"Authorization": "Bearer wrong"}, 401),
-        ({"Authorization": "Basic x"}, 401),
-    ]:
-        reply = client.post("/scenes?name=a.tif", content=TIFF, headers=headers)
-        assert reply.status_code == status, headers
-        assert stored_files(storage) == [], headers
-
-
-def test_a_token_to_read_does_not_upload(client: TestClient, bearer: Bearer):
-    assert bearer("read").post("/scenes?name=a.tif", content=TIFF).status_code == 403
-
-
 def test_a_scene_of_another_owner_is_not_found(client: TestClient, bearer: Bearer, storage: Storage):
     scene = bearer("register").post("/scenes?name=a.tif", content=TIFF).json()
     here = f"/scenes/{scene['id']}"

@@ -9,7 +9,7 @@ from pyproj import Transformer
 
 CRS = "http://www.opengis.net/def/crs/"
 CRS84, CRS84H = f"{CRS}OGC/1.3/CRS84", f"{CRS}OGC/0/CRS84h"
-ITEMS = "/collections/points/items"
+ITEMS, SEARCH = "/collections/points/items", "/collections/points/search"
 a_tenth_of_a_millimetre_deg = 1e-9
 a_millimetre = 1e-3
 
@@ -224,16 +224,43 @@ def test_req_filter_json_that_is_too_deep_or_no_cql2_is_refused(get):
     assert get(ITEMS, filter="[" * 5000, filter_lang="cql2-json").status_code == 400
 
 
+def pages(store, method, **question):
+    """The features of each page that a GET or a search by POST leads to."""
+    url, asked = (ITEMS, {"params": question}) if method == "GET" else (SEARCH, {"json": question})
+    found = []
+    while url:
+        reply = store.client.request(method, url, headers=store.headers, **asked)
+        assert reply.status_code == 200, reply.text
+        found.append(reply.json()["features"])
+        link = next((item for item in reply.json()["links"] if item["rel"] == "next"), {})
+        url, asked = link.get("href"), {"json": link["body"]} if "body" in link else {}
+    return found
+
+
+def test_the_pages_of_a_search_by_post_are_those_of_a_get_with_all_parameters(store):
+    lat_first = f"{CRS}EPSG/0/4326"
+    triangle = {"type": "Polygon", "coordinates": [[[43.2, 5.2], [43.2, 5.3], [43.3, 5.2], [43.2, 5.2]]]}
+    question = {
+        "bbox": "43.2,5.21,43.29,5.3",
+        "bbox-crs": lat_first,
+        "datetime": "2023-01-01/..",
+        "filter": json.dumps({"op": "s_intersects", "args": [{"property": "geometry"}, triangle]}),
+        "filter-lang": "cql2-json",
+        "filter-crs": lat_first,
+        "crs": lat_first,
+        "sortby": "-saliency",
+        "properties": "saliency,n_views",
+        "limit": 7,
+    }
+    found = pages(store, "GET", **question)
+    assert len(found) > 2
+    assert pages(store, "POST", **question) == found
+
+
 @pytest.mark.parametrize("sortby", ["-saliency", "typology,-saliency", "+saliency", "-first_view"])
-def test_req_sorting_pages_follow_each_other(get, made, sortby):
+def test_req_sorting_pages_follow_each_other(get, store, sortby):
     whole = get(ITEMS, sortby=sortby, limit=100).json()["features"]
-    seen, page = [], get(ITEMS, sortby=sortby, limit=7).json()
-    while True:
-        seen += page["features"]
-        following = [item["href"] for item in page["links"] if item["rel"] == "next"]
-        if not following:
-            break
-        page = get(following[0]).json()
+    seen = [one for page in pages(store, "GET", sortby=sortby, limit=7) for one in page]
     assert [one["id"] for one in seen] == [one["id"] for one in whole]
     assert len({one["id"] for one in seen}) == 60
     saliency = [one["properties"]["saliency"] for one in whole]
@@ -245,14 +272,9 @@ def test_a_polygon_too_long_for_a_url_is_searched_by_post_page_after_page(made, 
     angle = np.linspace(0.0, 2.0 * np.pi, 5_000)
     ring = np.column_stack([5.25 + 0.04 * np.cos(angle), 43.25 + 0.04 * np.sin(angle)])
     ring[-1] = ring[0]
-    body = {"intersects": {"type": "Polygon", "coordinates": [ring.tolist()]}, "limit": 10}
-    seen = []
-    while body:
-        reply = store.client.post("/collections/points/search", json=body, headers=store.headers)
-        assert reply.status_code == 200, reply.text
-        seen += [feature["id"] for feature in reply.json()["features"]]
-        following = [item for item in reply.json()["links"] if item["rel"] == "next"]
-        body = following[0]["body"] if following else None
+    inside = {"type": "Polygon", "coordinates": [ring.tolist()]}
+    found = pages(store, "POST", intersects=inside, limit=10)
+    seen = [feature["id"] for page in found for feature in page]
     away = np.hypot(*(made.points.lon_lat_h[:, :2] - [5.25, 43.25]).T)
     assert seen == (2**26 + np.flatnonzero(away < 0.04)).tolist()
     assert len(seen) > 10
