@@ -3,6 +3,7 @@
 import zipfile
 from dataclasses import replace
 from functools import partial
+from typing import Any
 from uuid import UUID
 
 import numpy as np
@@ -24,7 +25,7 @@ from amers.services.formats.block.document import rectangle
 from amers.services.formats.block.writer import write_block
 from amers.services.types import Frame, point_chips
 from tests.app.job_queue import claim, claimed, new_job
-from tests.factories import BOX, control_points, make_block, metadata, noise_chips
+from tests.factories import BOX, MadeBlock, control_points, make_block, metadata, noise_chips
 from tests.statements import run_sql
 
 COLUMNS = """st_asewkb(geom) as place, sigma_east_m, sigma_north_m, sigma_up_m, corr_east_north,
@@ -38,6 +39,20 @@ def chips(connection, storage):
     chips = StoredChips(storage, partial(find_chip_checksums, connection))
     yield chips
     chips.close()
+
+
+@pytest.fixture
+def publish(connection, storage, tmp_path):
+    """Makes a block of some points, and publishes it."""
+
+    def publish(count: int = 5, name: str = "calanques", **of_block: Any) -> MadeBlock:
+        made = make_block(tmp_path / name, count, name=name, **of_block)
+        lifecycle.ingest_block(connection, storage, made.folder)
+        lifecycle.publish_block(connection, name)
+        connection.commit()
+        return made
+
+    return publish
 
 
 def rows(connection, number: int) -> list:
@@ -55,11 +70,10 @@ def rows(connection, number: int) -> list:
 
 
 def test_a_block_that_is_exported_ingests_again_as_the_same_points_with_the_same_chips(
-    connection, storage, chips, tmp_path
+    connection, storage, chips, tmp_path, publish
 ):
-    made = make_block(tmp_path / "block")
-    first = lifecycle.ingest_block(connection, storage, made.folder).block
-    lifecycle.publish_block(connection, "calanques")
+    made = publish(40)
+    first = lifecycle.find_block(connection, "calanques")
     selected = select_points(connection, ExportBlock(BOX, id="copy"))
     written = write_selected(selected, chips, tmp_path / "copy")
     assert written == 40
@@ -72,26 +86,21 @@ def test_a_block_that_is_exported_ingests_again_as_the_same_points_with_the_same
     assert report.quality.points == 40
 
 
-@pytest.mark.parametrize("limit", [1, 7, 10, 39, 40, 41])
-def test_some_points_of_an_outline_are_spread_evenly_over_all_of_them(
-    connection, storage, tmp_path, limit
-):
-    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block").folder)
-    lifecycle.publish_block(connection, "calanques")
+def test_some_points_of_an_outline_are_spread_evenly_over_all_of_them(connection, publish):
+    publish(40)
     everything = point_store.control_points(connection, rectangle(*BOX)).points.id
-    some = point_store.control_points(connection, rectangle(*BOX), limit).points.id
-    assert len(some) == min(limit, len(everything))
-    places = np.searchsorted(everything, some)
-    steps = np.diff([*places, len(everything)])
-    assert set(steps) <= {len(everything) // limit, -(-len(everything) // limit), 1}
+    for limit in (1, 7, 10, 39, 40, 41, 10_000):
+        some = point_store.control_points(connection, rectangle(*BOX), limit).points.id
+        assert len(some) == min(limit, len(everything))
+        places = np.searchsorted(everything, some)
+        steps = np.diff([*places, len(everything)])
+        assert set(steps) <= {len(everything) // limit, -(-len(everything) // limit), 1}, limit
 
 
-def test_a_footprint_over_two_blocks_holds_what_is_served_of_both(connection, storage, chips, tmp_path):
+def test_a_footprint_over_two_blocks_holds_what_is_served_of_both(connection, publish, chips, tmp_path):
     half = (BOX[0], BOX[1], (BOX[0] + BOX[2]) / 2, BOX[3])
     for name, kind, seed in (("a", np.uint8, 1), ("b", np.uint16, 2)):
-        folder = make_block(tmp_path / name, 30, seed=seed, name=name, n_images=3, dtype=kind).folder
-        lifecycle.ingest_block(connection, storage, folder)
-        lifecycle.publish_block(connection, name)
+        publish(30, name, seed=seed, dtype=kind)
     expected = point_store.control_points(connection, rectangle(*half))
 
     written = write_selected(select_points(connection, ExportBlock(half)), chips, tmp_path / "out")
@@ -127,68 +136,70 @@ def test_a_footprint_over_two_blocks_holds_what_is_served_of_both(connection, st
     ],
 )
 def test_an_export_that_cannot_be_is_refused_and_writes_nothing(
-    connection, storage, chips, tmp_path, inputs, error, named
+    connection, publish, chips, tmp_path, inputs, error, named
 ):
-    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
-    lifecycle.publish_block(connection, "calanques")
+    publish()
     with pytest.raises(error, match=named):
         write_selected(select_points(connection, ExportBlock(**inputs)), chips, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_an_export_of_too_many_points_is_refused(connection, storage, chips, tmp_path):
-    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
-    lifecycle.publish_block(connection, "calanques")
+def test_as_many_points_as_are_allowed_are_exported_and_not_one_more(connection, publish):
+    publish(5)
+    assert len(select_points(connection, ExportBlock(BOX), most=5).points) == 5
     with pytest.raises(InputError, match="more than 4 points"):
         select_points(connection, ExportBlock(BOX), most=4)
 
 
-def test_as_many_points_as_are_allowed_are_exported(connection, storage, tmp_path):
-    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
-    lifecycle.publish_block(connection, "calanques")
-    assert len(select_points(connection, ExportBlock(BOX), most=5).points) == 5
+@pytest.fixture
+def side_by_side(connection, storage, tmp_path):
+    """Publishes a block `a` in the western half of the box and `b` in the eastern half."""
+    west, south, east, north = BOX
+    halves = {"a": (west, (west + east) / 2), "b": ((west + east) / 2, east)}
+
+    def publish(stated: dict[str, dict[str, Any]], n_images: dict[str, int]) -> None:
+        for name, (first, last) in halves.items():
+            box = (first, south, last, north)
+            document = replace(metadata(name, box=box), **stated[name])
+            contents = control_points(5, np.random.default_rng(7), box, n_images[name])
+            write_block(tmp_path / name, document, contents, noise_chips(contents), {})
+            lifecycle.ingest_block(connection, storage, tmp_path / name)
+            lifecycle.publish_block(connection, name)
+
+    return publish
 
 
 def test_an_export_of_several_blocks_claims_what_all_of_them_do_and_nothing_else(
-    connection, storage, tmp_path
+    connection, side_by_side
 ):
-    """West and east of one another, so that both are served."""
+    """Also of the number of images, which no point has more of than in its own block."""
     west, south, east, north = BOX
-    middle = (west + east) / 2
     stated = {
-        "a": replace(metadata("a", box=(west, south, middle, north)), license="CC-BY-4.0", epoch=2020.0),
-        "b": replace(metadata("b", box=(middle, south, east, north)), license="ODbL-1.0", epoch=2024.5),
+        "a": {"license": "CC-BY-4.0", "epoch": 2020.0},
+        "b": {"license": "ODbL-1.0", "epoch": 2024.5},
     }
-    for name, one in stated.items():
-        box = (one.extent[:, 0].min(), south, one.extent[:, 0].max(), north)
-        contents = control_points(5, np.random.default_rng(7), box)
-        write_block(tmp_path / name, one, contents, noise_chips(contents), {})
-        lifecycle.ingest_block(connection, storage, tmp_path / name)
-        lifecycle.publish_block(connection, name)
+    side_by_side(stated, {"a": 4, "b": 2})
     whole = select_points(connection, ExportBlock(BOX)).metadata
     assert (whole.license, whole.epoch) == ("CC-BY-4.0 AND ODbL-1.0", None)
     assert whole.accuracy == (), "neither states how well its frame is known"
-    western = select_points(connection, ExportBlock((west, south, middle, north))).metadata
+    assert whole.specification.min_views == 2
+    western = select_points(connection, ExportBlock((west, south, (west + east) / 2, north))).metadata
     assert (western.license, western.epoch) == ("CC-BY-4.0", 2020.0)
-    assert western.accuracy == stated["a"].accuracy
+    assert western.accuracy == metadata("a").accuracy
+    assert western.specification.min_views == 4
 
 
 @pytest.mark.parametrize("axes", [(0, 1), (1, 0)])
 def test_the_frame_of_an_export_of_several_blocks_is_as_good_as_its_worse_horizontal_axis(
-    connection, storage, tmp_path, axes
+    connection, side_by_side, axes
 ):
     """Heights are another figure: they may be better or worse than both."""
-    west, south, east, north = BOX
-    middle = (west + east) / 2
     variances = {"a": (1.0, 9.0, 100.0), "b": (4.0, 16.0, 0.01)}
-    for name, (first, last) in {"a": (west, middle), "b": (middle, east)}.items():
-        box = (first, south, last, north)
-        frame = Frame(np.diag([*np.array(variances[name])[[*axes]], variances[name][2]]))
-        contents = control_points(5, np.random.default_rng(7), box)
-        stated = replace(metadata(name, box=box), frame=frame)
-        write_block(tmp_path / name, stated, contents, noise_chips(contents), {})
-        lifecycle.ingest_block(connection, storage, tmp_path / name)
-        lifecycle.publish_block(connection, name)
+    frames = {
+        name: {"frame": Frame(np.diag([*np.array(of)[[*axes]], of[2]]))}
+        for name, of in variances.items()
+    }
+    side_by_side(frames, {"a": 3, "b": 3})
     whole = select_points(connection, ExportBlock(BOX)).metadata
     (figure,) = whole.accuracy
     own_m2 = np.diagonal(whole.frame.covariance_m2)
@@ -197,12 +208,8 @@ def test_the_frame_of_an_export_of_several_blocks_is_as_good_as_its_worse_horizo
     assert 3.0 < figure.value < 4.0, "between those of the blocks"
 
 
-def test_no_transaction_is_open_while_an_export_writes_files(
-    connection, database, dsn, settings, storage, tmp_path
-):
-    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
-    lifecycle.publish_block(connection, "calanques")
-    connection.commit()
+def test_no_transaction_is_open_while_an_export_writes_files(publish, database, dsn, settings, storage):
+    publish()
     open_transactions = []
 
     def count_transactions(fraction: float, message: str) -> None:
@@ -216,12 +223,8 @@ def test_no_transaction_is_open_while_an_export_writes_files(
     assert set(open_transactions) == {0}
 
 
-def test_a_block_is_exported_by_a_job_as_an_archive(
-    client, settings, connection, storage, bearer, tmp_path
-):
-    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
-    lifecycle.publish_block(connection, "calanques")
-    connection.commit()
+def test_a_block_is_exported_by_a_job_as_an_archive(client, settings, publish, bearer, tmp_path):
+    publish()
     reader = bearer("read")
     response = client.post(
         "/processes/export-block/execution", json={"inputs": {"bbox": list(BOX)}}, headers=reader
