@@ -11,6 +11,7 @@ from amers.app.db.engine import Connection
 from amers.app.db.jobs import attempts, jobs
 from amers.app.db.scene_files import SceneFiles, read_scene_files
 from amers.app.db.scene_registrations import SceneRegistration, last_registrations
+from amers.app.usecases.stored_scenes import stored_scenes
 from amers.app.usecases.tokens import create_token
 from tests.app.job_queue import claim, store_registration
 from tests.statements import run_sql
@@ -80,14 +81,19 @@ def done(connection: Connection, owner: UUID, scene_id: UUID, verdict: str = "go
     return job_id
 
 
+def every_scene(connection: Connection) -> list[UUID]:
+    """All scenes, asked for at once as a list does: each has what it would have alone."""
+    return [row["id"] for row in run_sql(connection, "select id from scene")]
+
+
 def shown(
     connection: Connection, scene_id: UUID, caller: UUID, most: int = 10
 ) -> list[SceneRegistration]:
-    return last_registrations(connection, [scene_id], caller, most).get(scene_id, [])
+    return last_registrations(connection, every_scene(connection), caller, most).get(scene_id, [])
 
 
 def files_of(connection: Connection, scene_id: UUID) -> SceneFiles:
-    return read_scene_files(connection, [scene_id])[scene_id]
+    return read_scene_files(connection, every_scene(connection))[scene_id]
 
 
 @pytest.mark.parametrize(
@@ -116,7 +122,9 @@ def test_a_registration_is_under_way_until_its_job_ends_and_gone_when_it_was_dis
 
 
 def test_the_newest_registrations_come_first_and_older_ones_are_left_out(connection, owner, scene):
-    made = [done(connection, owner, scene) for _ in range(4)]
+    """Of each scene as many, whatever others have that were registered in between and later."""
+    other = new_scene(connection, owner)
+    made = [done(connection, owner, one) for one in (scene, scene, other, scene, scene, other, other)]
     day = datetime.now().astimezone()
     for number, job in enumerate(made):
         run_sql(
@@ -124,8 +132,10 @@ def test_the_newest_registrations_come_first_and_older_ones_are_left_out(connect
             "update job set created_at = %s where id = %s",
             [day + timedelta(hours=number), job],
         )
-    assert [one.job_id for one in shown(connection, scene, owner)] == made[::-1]
-    assert [one.job_id for one in shown(connection, scene, owner, most=2)] == [made[3], made[2]]
+    for one, places in ((scene, [4, 3, 1, 0]), (other, [6, 5, 2])):
+        newest = [made[place] for place in places]
+        assert [found.job_id for found in shown(connection, one, owner)] == newest
+        assert [found.job_id for found in shown(connection, one, owner, most=2)] == newest[:2]
 
 
 def test_a_registration_is_shown_to_the_owners_of_the_scene_and_of_the_job_alone(
@@ -158,6 +168,7 @@ def test_the_files_of_a_scene_are_those_of_its_last_registration_that_has_files_
     connection, owner, scene
 ):
     older, newer = done(connection, owner, scene), done(connection, owner, scene)
+    done(connection, owner, new_scene(connection, owner))
     files = files_of(connection, scene)
     assert (files.image, files.models, files.job_id) == ("a.tif", ["a_RPC.TXT"], newer)
     assert files.results == {"report.json": f"results/{newer}/1/report.json"}
@@ -169,6 +180,23 @@ def test_the_files_of_a_scene_are_those_of_its_last_registration_that_has_files_
     assert (files.job_id, files.results) == (older, {"report.json": f"results/{older}/1/report.json"})
     assert files.accuracy is not None
     assert files.accuracy["verdict_scope"] == str(newer), "its report is in the store for ever"
+
+
+def test_of_the_jobs_that_registered_a_scene_the_model_of_the_last_in_the_list_is_used(
+    connection, owner, scene
+):
+    """Whichever ran last; one that registered another scene is passed over."""
+    made = []
+    for registered_scene in (scene, scene, new_scene(connection, owner)):
+        job = asked(connection, owner, registered_scene)
+        files = {"correction.json": f"results/{job}/1/correction.json"}
+        store_registration(connection, job_id=job, scene_id=registered_scene, files=files)
+        made.append(job)
+    first, second, of_another = made
+    for order in ([first, second, of_another], [of_another, second, first]):
+        (stored,) = stored_scenes(connection, [scene], order)
+        used = second if order[0] == first else first
+        assert stored.model == [f"results/{used}/1/correction.json"]
 
 
 def test_a_removed_scene_offers_no_files_of_its_own(connection, owner, scene):
