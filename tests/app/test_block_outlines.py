@@ -98,15 +98,17 @@ def test_the_outline_of_a_corner_leaves_out_the_ground_that_has_no_points(
 
 
 def test_the_extent_of_a_block_holds_its_outline_and_a_tenth_of_a_metre_more_at_most(ingest):
+    """Its west is above its east where the outline goes on beyond 180 degrees, and nowhere else."""
     block = ingest(spread(CORNER))
     rng = np.random.default_rng(6)
-    for _ in range(20):
-        outline = [5.2, -43.2] + rng.uniform(0.0, 0.1, (5, 2))
+    for ends in 9 * [(5.2, 5.3), (179.9, 180), (-180, -179.9), (179.95, 180.05), (-180.03, -179.93)]:
+        lon, lat = np.array([*ends, *rng.uniform(*ends, 3)]), rng.uniform(-43.2, -43.1, 5)
+        outline = np.column_stack([lon, lat])
         west, south, east, north = block_extent(replace(block, outline=outline))
-        beyond = np.concatenate(
-            [outline.min(axis=0) - [west, south], [east, north] - outline.max(axis=0)]
-        )
-        assert (beyond >= 0.0).all()
+        assert (west > east) == (np.abs(lon).max() > 180.0)
+        to_west, to_east = ((side - lon + 180.0) % 360.0 - 180.0 for side in (west, east))
+        beyond = np.array([side.min() for side in (-to_west, to_east, lat - south, north - lat)])
+        assert (beyond >= -1e-12).all()
         assert (beyond <= 1.01e-6).all()
 
 

@@ -183,6 +183,19 @@ def test_the_document_of_a_model_has_the_model_as_delivered(world: FlatWorld) ->
     assert again.sigma_m == SIGMA_M
 
 
+def test_the_sigma_of_a_followed_place_is_that_of_its_worse_coordinate(world: FlatWorld) -> None:
+    """Ground of unknown height moves along the line of sight, which is along the samples."""
+    scene = read_scene(world.tagged, sigma_m=SIGMA_M)
+    marks = [SetMark(**mark) for mark in set_marks(world)]
+    stated = PointStatements(sigma_m=(0.1, 10.0), mark_sigma_px=0.2)
+    adjusted = adjust_set_marks(scene, marks, [Place(600.0, 550.0)], HeightSource(), stated)
+    assert adjusted.registration is not None
+    at = np.array([[600.0, 550.0]])
+    lines_px, samples_px = np.sqrt(np.diagonal(adjusted.registration.adjustment.covariance_at(at)[0]))
+    assert adjusted.places[0].sigma_px == pytest.approx(samples_px)
+    assert samples_px > 1.2 * lines_px
+
+
 def test_marks_in_an_ortho_image_need_no_heights(tmp_path: Path) -> None:
     """A map grid that is moved by 12 m comes back, from a document of its model."""
     path, moved_m = tmp_path / "ortho.tif", np.array([12.0, -5.0])

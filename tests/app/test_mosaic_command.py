@@ -83,6 +83,7 @@ def test_pixels_sources_and_seams_are_written(images: tuple[Path, ...], tmp_path
         number, seen = sources.read(1), pixels.read(1) > 0
         assert (seen == (number > 0)).all()
         assert set(np.unique(number)) == {0, 1, 2, 3}
+        assert mosaic.seen == pytest.approx(np.mean(seen))
         ground = shapely.box(*pixels.bounds)
     seams = pyogrio.raw.read(mosaic.seams)
     names = dict(zip(seams[0]["fields"], seams[3], strict=True))

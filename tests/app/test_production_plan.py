@@ -100,6 +100,27 @@ def test_images_of_a_catalogue_are_planned_with_its_directions(tmp_path: Path) -
     degrees2_m2 = [np.prod(metres_per_degree(image.lon_lat[1], 0.0)) for image in images]
     np.testing.assert_allclose(areas_m2, shapely.area(footprints) * degrees2_m2, rtol=0.05)
     assert len({image.pass_name for image in images if image.pass_name}) > 1
+    # The sides of their boxes differ as their own do, for none is turned by 45 degrees.
+    box_m = np.diff(shapely.bounds(footprints).reshape(-1, 2, 2), axis=1)[:, 0] * [
+        metres_per_degree(image.lon_lat[1], 0.0) for image in images
+    ]
+    longer_m = np.array([image.size_m[0] - image.size_m[1] for image in images])
+    assert (np.sign(box_m[:, 1] - box_m[:, 0]) == np.sign(longer_m)).all()
+
+
+@pytest.mark.parametrize("sides_km", [(24.0, 12.0), (12.0, 24.0)])
+def test_candidates_lie_as_far_apart_as_stated_along_and_across_an_image(
+    tmp_path: Path, sides_km: tuple[float, float]
+) -> None:
+    path = tmp_path / "plan.json"
+    sides = dict(zip(("along_km", "across_km"), sides_km, strict=True))
+    image = {**PLAN["images"][0], **sides}
+    path.write_text(json.dumps({**PLAN, "images": [image], "candidates": {"spacing_km": 4.0}}))
+    places = np.array([site.lon_lat for site in read_plan(path).candidates])
+    from_image_km = (places - [image["lon"], image["lat"]]) * metres_per_degree(43.3, 0.0) / 1000.0
+    for positions_km, side_km in zip(from_image_km.T, sides_km[::-1], strict=True):
+        lattice = np.arange(2.0 - side_km / 2.0, side_km / 2.0, 4.0)
+        np.testing.assert_allclose(np.unique(positions_km.round(6)), lattice, atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from tests.services.surface.worlds import town
 from tests.unproven import unproven_storage
 
 OPEN_GROUND = town().centre_lon_lat[None, :] + [[0.0, -0.0004]]
-MADE = {"gsd_m": 1.0, "heights_m": OPTIONS.heights_m}
+MADE = {"gsd_m": 1.25, "heights_m": OPTIONS.heights_m}
 a_tenth_of_the_base_m = 0.3
 
 
