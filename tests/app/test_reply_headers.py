@@ -50,6 +50,10 @@ def test_files_are_not_stored_and_not_guessed(client: TestClient, bearer: Bearer
     assert reply.content == TIFF
     assert reply.headers["cache-control"] == "no-store"
     assert reply.headers["x-content-type-options"] == "nosniff"
+    parts = (part.strip().partition(" ") for part in reply.headers["content-security-policy"].split(";"))
+    policy = {name: sources for name, _, sources in parts}
+    assert (policy["default-src"], policy["sandbox"]) == ("'none'", ""), "a page among them runs nothing"
+    assert not policy.keys() & {"script-src", "script-src-elem", "connect-src", "form-action"}
 
 
 def test_the_reply_to_an_unexpected_error_has_the_headers_too(settings: Settings):
