@@ -559,9 +559,10 @@ def correct_vectors(
     """
     files = _files_of(scene)
     of_registration = None if registration is None else Path(registration)
+    origin = None if files.crop_origin is None else "{},{}".format(*files.crop_origin)
     return correct_file(
         VectorFile(Path(vectors)),
-        SceneModel(files.image, files.model, of_registration, files.sigma_m),
+        SceneModel(files.image, files.model, of_registration, files.sigma_m, origin),
         _terrain_file(terrain),
         Path(output),
         crs=crs,

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from amers.services.registration.options import RegistrationOptions
 from amers.services.surface.options import SurfaceOptions
 from scripts.recipes import LIBRARY, recipes, write_files, write_modules_of_others
 from tests.app.flat_world import CENTRE, GROUND_H, SHIFT_PX, FlatWorld, make_flat_world
+from tests.app.recorders import Recorders
 from tests.imports import beyond_budget, imported_by
 
 ROOT = Path(__file__).parent.parent
@@ -144,6 +146,116 @@ def test_defaults_are_those_of_the_science():
     assert default("correct_vectors", "pixels") == CorrectionOptions().pixels
 
 
+OPTIONS: dict[str, tuple[tuple[Any, ...], dict[str, Any]]] = {
+    "open_scene": (
+        (),
+        {"model": "b.rpb", "sigma_m": 17.5, "bands": "2", "mask": "m.tif", "crop_origin": (19.5, 23.5)},
+    ),
+    "open_terrain": (("d.tif",), {"vertical": "EGM96", "geoid": "e.gtx", "fill_px": 3}),
+    "refine": (("m.csv", "out"), {"heights": "EGM96", "order": "drift"}),
+    "register": (
+        ("base", "out"),
+        {
+            "control": "f.csv",
+            "control_heights": "EGM96",
+            "control_sigma_m": (17.5, 19.5),
+            "control_frame_sigma_m": (23.5, 29.5),
+            "check_points": "g.csv",
+            "max_points": 31,
+            "max_ce90_on_earth_m": 37.5,
+            "copy_image": True,
+        },
+    ),
+    "register_on_reference": (
+        ("r.tif", "d.tif", "out"),
+        {"check_points": "g.csv", "max_ce90_on_earth_m": 37.5, "copy_image": True},
+    ),
+    "register_together": (("base", "out"), {"copy_image": True, "jobs": 3}),
+    "produce_points": (
+        ("out",),
+        {"gsds_m": (17.5, 19.5), "points": 23, "sigma_m": 29.5, "licence": "a licence", "jobs": 3},
+    ),
+    "orthorectify": (
+        ("d.tif", "o.tif"),
+        {"crs": "EPSG:32631", "gsd_m": 17.5, "hide": True, "registration": "reg"},
+    ),
+    "straighten": (("reg", "o.tif"), {}),
+    "surface": (("o.tif",), {"gsd_m": 17.5, "heights_m": (19.5, 23.5), "pairs": 29, "jobs": 3}),
+    "mosaic": (("o.tif", "d.tif"), {"gsd_m": 17.5, "level": True, "jobs": 3}),
+    "correct_vectors": (
+        ("d.tif", "o.gpkg"),
+        {"registration": "reg", "crs": "EPSG:32631", "pixels": "centre", "sigma_px": 17.5},
+    ),
+    "match_images": ((), {"gsd_m": 17.5, "max_ratio": 0.19, "tolerance_px": 23.5}),
+}
+"""Arguments after the scenes, and options, each with a value that no other has."""
+OF_MANY = {"register_together", "surface", "mosaic", "produce_points"}
+ARRIVE_AS = {
+    "model": "1",
+    "bands": "bands[0]",
+    "control": "paths[0]",
+    "heights": "1",
+    "order": "2",
+    "licence": "license",
+    "gsds_m[0]": "fine_gsd_m",
+    "gsds_m[1]": "coarse_gsd_m",
+}
+"""Names, or places, under which options arrive that are neither their own nor its end."""
+
+
+def handed_on(
+    name: str, stated: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> set[tuple[str, str]]:
+    """Values that a task of the library hands on, each after its name; of a scene, with statements."""
+    task, (more, options) = getattr(amers, name), OPTIONS[name]
+    with monkeypatch.context() as recorded:
+        modules = ("amers.tasks", "amers.opened", "amers.geometry")
+        recorders = [Recorders(recorded, module) for module in modules]
+        scene = amers.open_scene("a.tif", **stated) if stated else "a.tif"
+        given: dict[str, tuple[Any, ...]] = {
+            "open_terrain": (),
+            "match_images": (scene, "b.tif"),
+            "correct_vectors": ("v.gpkg", scene),
+            **dict.fromkeys(OF_MANY, ([scene],)),
+        }
+        task(*given.get(name, (scene,)), *more, **options)
+    return {
+        (re.split(r"[.(]", path)[-1].replace(")", ""), value)
+        for one in recorders
+        for path, value in one.notes
+        if not (stated and path.startswith("read_scene"))
+    }
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_an_option_arrives_under_its_name(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    notes = handed_on(name, {}, monkeypatch)
+    for option, given in OPTIONS[name][1].items():
+        several = (
+            {f"{option}[{n}]": value for n, value in enumerate(given)}
+            if isinstance(given, tuple)
+            else {option: given}
+        )
+        for place, value in several.items():
+            names = {one for one, text in notes if text == str(value)}
+            assert any(ARRIVE_AS.get(place, place).endswith(one) for one in names), (place, names)
+
+
+@pytest.mark.parametrize(
+    "name", sorted(OPTIONS.keys() - {"open_scene", "open_terrain", "produce_points"})
+)
+def test_what_was_stated_of_a_scene_goes_with_it(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The scene as it was opened, or its files with the statements about them."""
+    monkeypatch.chdir(tmp_path)
+    notes = handed_on(name, {"model": "own.rpb", "crop_origin": (41.25, 43.25)}, monkeypatch)
+    texts = " ".join(text for _, text in notes)
+    is_opened = "read_scene()" in texts.split()
+    assert is_opened or all(text in texts for text in ("own.rpb", "41.25", "43.25"))
+
+
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
     return make_flat_world(tmp_path_factory.mktemp("world"), size=600, points=4)
@@ -164,7 +276,10 @@ def test_one_place_gives_one_answer_and_many_give_many(scene: amers.Scene):
     assert (many == one).all()
     back = amers.locate(scene, one, GROUND_H)
     assert back == pytest.approx(GROUND, abs=1e-9)
-    assert amers.locate(scene, many, [GROUND_H, GROUND_H]).shape == (2, 3)
+    heights_m = [GROUND_H, GROUND_H + 300.0]
+    each = [amers.locate(scene, one, height_m) for height_m in heights_m]
+    assert (amers.locate(scene, many, heights_m) == each).all()
+    assert each[0][0] != each[1][0]
     assert (amers.project(scene.files.image, GROUND) == one).all()
     assert (amers.project(str(scene.files.image), GROUND) == one).all()
 
@@ -177,11 +292,18 @@ def test_one_place_gives_one_answer_and_many_give_many(scene: amers.Scene):
         ([500.0, 43.0, 0.0], "longitude 500 found"),
         ([5.25, 43.25], r"shape \(2,\) found, \(3,\) or \(n, 3\) expected"),
         (["east", 43.25, 0.0], "numbers expected"),
+        ([360.001, 43.25, 0.0], "longitude 360.001 found"),
+        ([5.25, -90.001, 0.0], "latitude -90.001 found"),
     ],
 )
 def test_what_is_no_ground_is_refused_by_name(scene: amers.Scene, ground: list, message: str):
     with pytest.raises(amers.InputError, match=message):
         amers.project(scene, ground)
+
+
+def test_the_poles_and_a_whole_turn_are_ground(scene: amers.Scene):
+    edges = [[360.0, 43.25, 0.0], [-360.0, 43.25, 0.0], [5.25, 90.0, 0.0], [5.25, -90.0, 0.0]]
+    assert amers.project(scene, edges).shape == (4, 2)
 
 
 def test_a_latitude_is_refused_wherever_ground_is_given(scene: amers.Scene):
@@ -244,6 +366,24 @@ def test_one_mark_shifts_a_model_and_a_wrong_one_is_rejected(scene: amers.Scene)
     moved[2] += 60.0
     refinement = amers.refine(scene, (ground, moved))
     assert np.flatnonzero(~refinement.adjustment.active).tolist() == [2]
+
+
+def test_the_precision_of_marks_counts_where_their_file_states_none(scene: amers.Scene, tmp_path: Path):
+    """A mark of a tenth of a pixel and one of ten or a tenth of a pixel, which contradict each other."""
+    seen = np.array([[300.0, 300.0], [310.0, 300.0]])
+    ground = amers.locate(scene, seen, GROUND_H)
+    rows = [
+        f"{lon!r},{lat!r},{h!r},{line!r},{sample!r},{sigma}"
+        for (lon, lat, h), (line, sample), sigma in zip(
+            ground.tolist(), (seen + [[0.4, 0.0], [-0.4, 0.0]]).tolist(), ("0.1", ""), strict=True
+        )
+    ]
+    head = "# pixel-origin=centre heights=ellipsoid\nlon,lat,height_m,line,sample,sigma_px"
+    (tmp_path / "marks.csv").write_text("\n".join([head, *rows]) + "\n")
+    for sigma_px, moved_px in ((10.0, 0.4), (0.1, 0.0)):
+        refinement = amers.refine(scene, tmp_path / "marks.csv", sigma_px=sigma_px)
+        moved = amers.project(refinement, ground) - seen
+        assert moved == pytest.approx(np.array([[moved_px, 0.0]] * 2), abs=0.05)
 
 
 def test_results_need_a_folder_for_what_only_files_have(tmp_path: Path):
