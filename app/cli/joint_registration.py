@@ -53,6 +53,7 @@ class JointRequest:
         copy_image: also copy GeoTIFFs, with the refined models in their tags.
         max_ce90_on_earth_m: see `QualificationOptions`.
         jobs: processes at once.
+        words: of a command line that asks for the same, but for the scenes and the output.
     """
 
     files: Sequence[SceneFiles]
@@ -63,6 +64,7 @@ class JointRequest:
     copy_image: bool
     max_ce90_on_earth_m: float | None
     jobs: int
+    words: Sequence[str] = ()
 
     @property
     def options(self) -> RegistrationOptions:
@@ -73,17 +75,8 @@ class JointRequest:
     @property
     def command(self) -> str:
         """The command that registers the scenes again, without the accuracy of their models."""
-        rigorous = self.files[0].rigorous
-        named = {
-            "--block": self.block,
-            "--join": self.joined,
-            "--rigorous": rigorous,
-            "-o": self.output,
-        }
-        words = [str(one.image) for one in self.files]
-        words += [str(word) for pair in named.items() if pair[1] is not None for word in pair]
-        if self.marks is not None:
-            words += [word for path in self.marks.paths for word in ("--control", str(path))]
+        images = [str(one.image) for one in self.files]
+        words = [*images, *self.words, "-o", str(self.output)]
         return shlex.join(["amers", "scene", "register-many", *words])
 
     def scene(self, files: SceneFiles) -> SceneRequest:

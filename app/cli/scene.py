@@ -1,7 +1,7 @@
 """`amers scene register`: scenes registered one by one."""
 
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -220,13 +220,15 @@ def register(
     refuse_shared_files(images, options.files_of_one)
     control_files = control.files(mark_files)
     models_of = models.of(images)
-    repeated = [*words_of(models), *words_of(options), *words_of(control), *words_of(marks)]
+    repeated = [*words_of(options), *words_of(control), *words_of(marks)]
+    repeated += words_of(replace(result, output=ResultOptions.output))
     repeated += [] if work.server is None else ["--server", work.server]
     requests = []
     for image in images:
         folder = result.output if is_one_scene else result.output / scene_name(image)
         # Without the accuracy of the model, which the report of a failure advises to state anew.
-        command = shlex.join(["amers", "scene", "register", str(image), *repeated, "-o", str(folder)])
+        words = [str(image), *_model_words(*models_of[image]), *repeated, "-o", str(folder)]
+        command = shlex.join(["amers", "scene", "register", *words])
         requests.append(
             SceneRequest(
                 options.of(image, models_of[image], sigma_m),
@@ -244,3 +246,9 @@ def register(
         write_overview(outcomes, result.output)
         show_outcomes(outcomes, as_json=as_json)
     raise typer.Exit(worst_status(outcomes))
+
+
+def _model_words(model: Path | None, crop_origin: CropOrigin | None) -> list[str]:
+    """The words of a command line that give one image its model."""
+    words = [] if model is None else ["--model", str(model)]
+    return words if crop_origin is None else [*words, "--crop-origin", "{},{}".format(*crop_origin)]

@@ -1,6 +1,6 @@
 """`amers scene register-many`: scenes registered in one adjustment."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -8,7 +8,7 @@ import typer
 
 from amers.app.cli.control_options import MarkOptions
 from amers.app.cli.joint_registration import JointRequest, register_together
-from amers.app.cli.options import FromMilli
+from amers.app.cli.options import FromMilli, words_of
 from amers.app.cli.output import AsJson, print_json, show_one
 from amers.app.cli.scene_registration import images_of, worst_status
 from amers.app.cli.scene_rows import refuse_shared_files, show_failures, show_outcomes
@@ -94,6 +94,8 @@ def register_many(
         copy_image=options.copy_image,
         max_ce90_on_earth_m=options.max_ce90_on_earth_m,
         jobs=jobs,
+        # Without the accuracy of the models, which the report of a failure advises to state anew.
+        words=[*words_of(models), *words_of(replace(options, sigma_m=())), *words_of(marks)],
     )
     outcomes, joint = register_together(request)
     show_failures(outcomes, context)

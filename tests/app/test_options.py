@@ -1,21 +1,24 @@
 """Options of commands, declared as the fields of dataclasses."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
+from amers.app.cli import scene, scenes_together
 from amers.app.cli.control_options import ControlOptions
+from amers.app.cli.main import app
 from amers.app.cli.options import FromMilli, Shown, with_options, words_of
 from amers.app.usecases.points_production import KnownPointFiles
 from amers.services.docstrings import attribute_descriptions
 from amers.services.formats.gcp.csv_points import PIXEL_ORIGINS
 from amers.services.formats.gcp.text_formats import ECEF, LAT_LON_HEIGHT
 from amers.services.quality.check_points import MARKING_SIGMA_PX
-from tests.app.wiring import commands, parameters
+from tests.app.wiring import commands, parameters, value_of
 
 
 @dataclass(frozen=True)
@@ -196,3 +199,50 @@ def test_a_folder_of_intermediate_results_may_be_new():
     ]
     assert len(made) >= 4
     assert not any(one.type_descriptor.parameter_info.exists for one in made)
+
+
+class Asked(Exception):
+    """Carries what a command asks for, in place of the work."""
+
+
+def asked(words: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
+    """What a command on scenes hands on to be registered."""
+
+    def note(*given: Any) -> None:
+        raise Asked(*given)
+
+    monkeypatch.setattr(scene, "check_map", lambda _image: None)
+    monkeypatch.setattr(scene, "register_scenes", note)
+    monkeypatch.setattr(scenes_together, "register_together", note)
+    with pytest.raises(Asked) as found:
+        app(words, standalone_mode=False)
+    return found.value.args
+
+
+@pytest.mark.parametrize("command", ["register", "register-many"])
+@pytest.mark.parametrize("names", [("a.tif",), ("a.tif", "b.tif")])
+def test_the_command_in_a_report_asks_for_the_same_again(
+    command: str, names: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With every option but the accuracy of models, which is stated anew, and those of the machine."""
+    left_out = {"--sigma-m", "--jobs", "--server", "--token", "--json", "--model", "--crop-origin"}
+    left_out |= {"--mask", "--check-points"} if len(names) > 1 else set()
+    words = ["scene", command, *names]
+    for one in parameters(("scene", command)):
+        if not one.required and one.opts[0] not in left_out:
+            option, *value = value_of(one, tmp_path)
+            words += [option, *({"--bands": ["2"], "--rigorous": ["srp"]}.get(option, value))]
+    for number, name in enumerate(names):
+        (tmp_path / f"{number}.rpb").touch()
+        words += [
+            "--model",
+            f"{name}={tmp_path / str(number)}.rpb",
+            "--crop-origin",
+            f"{name}={number},7",
+        ]
+    given = asked(words, monkeypatch)
+    for request in given[0] if command == "register" else given:
+        again = asked(shlex.split(request.command)[1:], monkeypatch)
+        assert again[0] == ([request] if command == "register" else request)
+        if len(names) == 1:
+            assert again == given
