@@ -411,7 +411,7 @@ def register_many(requests: Sequence[SceneRequest], control: Control, jobs: int)
 
 def _environment(stack: ExitStack, control: Control) -> dict[str, str]:
     """Variables with the place of the store, which stays open until the stack is closed."""
-    if control.block is not None or control.reference is not None:
+    if control != Control(None, None):
         return {}
     settings = read_settings()
     database = stack.enter_context(engine.opened(settings))

@@ -2,6 +2,7 @@
 
 import json
 import os
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,13 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
+from amers.app.cli import scene_registration
+from amers.app.cli.remote import _inputs_of_marks, _to_send
+from amers.app.cli.scene_registration import Control, _environment
+from amers.app.usecases.marked_files import PointStatements
 from amers.app.usecases.registration.control_marks import MarkFiles, marks_as_opf
+from amers.app.usecases.registration.reference_source import ReferenceFiles
+from amers.app.usecases.registration.register import SceneFiles
 from amers.app.usecases.terrain_file import TerrainFile
 from amers.services.formats.gcp.reader import read_control_points
 from amers.services.formats.images.raster import write_raster
@@ -191,6 +198,37 @@ def test_marks_on_a_map_and_a_terrain_are_sent_as_longitude_latitude_and_height(
     assert np.allclose(read.line_sample, picked)
     assert read.check.tolist() == [False, False, True]
     assert np.allclose(read.sigma_m, [[0.1, 0.1, 0.2]] * 3)
+
+
+def test_what_is_stated_of_marks_goes_with_them_to_a_service(image, tmp_path):
+    """Beside one file, which is sent as it is; within one file made of two, but for the common error."""
+    paths = tuple(write_marks(tmp_path / f"{name}.csv", 3, HEAD, "") for name in "ab")
+    stated = PointStatements(sigma_m=(1.7, 1.9), frame_sigma_m=(2.3, 2.9), mark_sigma_px=0.7)
+    inputs = {"control_frame_sigma_m": (2.3, 2.9)}
+    made = _to_send(MarkFiles(paths, stated), SceneFiles(image), tmp_path)
+    assert _inputs_of_marks(made) == inputs
+    read = read_control_points(made.paths[0])
+    assert np.allclose(read.sigma_m, [1.7, 1.7, 1.9])
+    assert np.allclose(read.sigma_px, 0.7)
+    given = _to_send(MarkFiles(paths[:1], stated), SceneFiles(image), tmp_path)
+    assert given.paths == paths[:1]
+    inputs |= {"control_sigma_m": (1.7, 1.9), "control_mark_sigma_px": 0.7}
+    assert _inputs_of_marks(given) == inputs
+
+
+def test_scenes_on_control_of_their_own_open_no_store(monkeypatch, tmp_path):
+    def opened(_settings: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(scene_registration.engine, "opened", opened)
+    reference = ReferenceFiles(tmp_path, None)
+    own = (
+        Control(tmp_path, None),
+        Control(None, reference),
+        Control(None, None, MarkFiles((tmp_path,))),
+    )
+    with ExitStack() as stack:
+        assert [_environment(stack, control) for control in own] == [{}, {}, {}]
 
 
 def test_marks_of_other_images_are_refused_by_their_names(image):
