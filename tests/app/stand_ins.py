@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from datetime import UTC, date, datetime, timedelta
 from enum import Enum
+from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
 from unittest.mock import MagicMock
@@ -184,7 +185,7 @@ def _single(kind: type, path: str, depth: int) -> Any:
         kinds = {name: field.annotation for name, field in kind.model_fields.items()}
         return kind.model_construct(**_filled(kinds, path, depth))
     if dataclasses.is_dataclass(kind):
-        hints = typing.get_type_hints(kind)
+        hints = _hints(kind)
         made = object.__new__(kind)
         names = {field.name: hints[field.name] for field in dataclasses.fields(kind)}
         values = _filled(names, path, depth)
@@ -217,9 +218,20 @@ def _array(kind: Any, path: str, shape: tuple[int, ...]) -> Any:
         return np.arange(count).reshape(shape) % 2 == 1
     if scalar is np.int64:
         return np.arange(count).reshape(shape) % 2
-    return np.array([_number(f"{path}[{place}]") for place in range(count)]).reshape(shape) / 8.0
+    return np.reshape(_numbers(path, count), shape) / 8.0
 
 
+@cache
+def _numbers(path: str, count: int) -> tuple[int, ...]:
+    return tuple(_number(f"{path}[{place}]") for place in range(count))
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    return typing.get_type_hints(kind)
+
+
+@cache
 def _shapes(kind: type) -> dict[str, tuple[int, ...]]:
     """The shapes of arrays that the docstring of a dataclass states, with 2 for any letter."""
     return {

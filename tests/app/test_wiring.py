@@ -5,14 +5,17 @@ field. After a change that is meant, write it anew (`python -m tests.app.wiring`
 """
 
 import json
+import math
 from pathlib import Path
 
 import pytest
 
-from tests.app.wiring import GOLDEN, NO_OPTIONS, commands, wiring
+from tests.app.wiring import GOLDEN, NO_OPTIONS, commands, limits, wiring
 
 EXPECTED = json.loads(GOLDEN.read_text())
-NOWHERE = 28
+UNITS = {1.0, 0.01, 1000.0}
+"""By what options are multiplied: none, per cent, and kilometres in metres."""
+NOWHERE = 10
 """Options, of 439, whose way is not seen so: they need others in a way of their own, or what they are
 given to is a result, for which nothing stands in. The number may not grow."""
 
@@ -20,6 +23,31 @@ given to is a result, for which nothing stands in. The number may not grow."""
 @pytest.mark.parametrize("words", list(commands()), ids=" ".join)
 def test_options_arrive_where_they_did(words: tuple[str, ...], tmp_path: Path) -> None:
     assert wiring(words, tmp_path) == EXPECTED[" ".join(words)]
+
+
+@pytest.mark.parametrize("words", list(commands()), ids=" ".join)
+def test_an_option_at_its_limit_arrives_where_one_between_its_limits_does(
+    words: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Zero is no option that was not given, and the largest is not cut; units are as for the others."""
+    for option, between, limit, notes in limits(words, tmp_path):
+        for line in EXPECTED[" ".join(words)][option]:
+            path, _, text = line.partition(" = ")
+            if (share := number(text) / between) in UNITS:
+                found = [
+                    number(note.removeprefix(f"{path} = "))
+                    for note in notes
+                    if note.startswith(f"{path} = ")
+                ]
+                assert found == [pytest.approx(share * limit)], (option, limit)
+
+
+def number(text: str) -> float:
+    """The number that a text is."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def test_nearly_all_options_are_seen_to_arrive() -> None:

@@ -57,9 +57,11 @@ TEXTS: Mapping[str, str] = {
     "--control-vertical": "EGM96",
     "--kernel": "bilinear",
     "--scope": "read",
+    "--sigma-m": "17.5",
     "reference": "flat@2",
     "--control-sigma-m": "17,19",
     "--control-frame-sigma-m": "17,19",
+    "--control-dem-frame-sigma-m": "17,19",
     "--site-frame-sigma-m": "17,19",
     "--point-sigma-m": "17,19",
     "--columns": "lon=a,lat=b",
@@ -80,20 +82,26 @@ BESIDE: Mapping[str, tuple[str, ...]] = {
     "vectors project": ("--vertical", "ellipsoid"),
     "block renew": ("--image", "image"),
     "block frame": ("--control", "FILE", "--images", "FILE"),
-    "production run": ("--images", "FILE"),
+    "production run": ("--catalogue", "FILE"),
     "base make": ("--bbox", "1.0", "2.0", "1.1", "2.1"),
 }
 """Words that commands need beside what they require, FILE for a file."""
 _DEM = ("--dem", "FILE")
 COMPANIONS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("--control-ortho-", ("--control-ortho", "FILE", "--control-dem", "FILE")),
-    ("--control-dem-", ("--control-dem", "FILE", "--control-dem-vertical", "ellipsoid")),
+    (
+        "--control-dem-",
+        ("--control", "FILE", "--control-dem", "FILE", "--control-dem-vertical", "ellipsoid"),
+    ),
     ("--control-", ("--control", "FILE")),
     ("--reference-", ("--reference", "FILE", *_DEM, "--vertical", "ellipsoid")),
     ("--reference", (*_DEM, "--vertical", "ellipsoid")),
     ("--dem-", (*_DEM, "--dem-vertical", "ellipsoid")),
-    ("--vertical", _DEM),
-    ("--geoid", (*_DEM, "--vertical", "EGM2008")),
+    ("--dem", ("--reference", "FILE")),
+    ("--vertical", ("--reference", "FILE", *_DEM)),
+    ("--geoid", ("--reference", "FILE", *_DEM, "--vertical", "EGM2008")),
+    ("--exclude-heights", (*_DEM, "--vertical", "ellipsoid")),
+    ("--land-cover", (*_DEM, "--vertical", "ellipsoid")),
     ("--token", ("--server", "http://127.0.0.1:9")),
 )
 """What an option needs beside it, by how its name begins; the first that fits."""
@@ -140,7 +148,7 @@ def value_of(parameter: Any, folder: Path) -> list[str]:
     if kind is UUID:
         return [*given, AN_ID]
     if kind is datetime:
-        return [*given, "2017-03-19T11:13:00"]
+        return [*given, f"{datetime(2017, 3, 19):{parameter.type_descriptor.parameter_info.formats[0]}}"]
     if parameter.nargs > 1:
         return [*given, *(str(17 + number) for number in range(parameter.nargs))]
     if parameter.type_descriptor.parameter_info.exists or parameter.name in _FILES:
@@ -240,15 +248,11 @@ def _record_service(recorders: Recorders, monkeypatch: pytest.MonkeyPatch) -> No
 def wiring(words: tuple[str, ...], folder: Path) -> dict[str, list[str]]:
     """Where each option of a command goes, and as what."""
     own = parameters(words)
-    (folder / "beside").write_text("")
-    (folder / "empty").mkdir()
-    beside = [str(folder / "beside") if w == "FILE" else w for w in BESIDE.get(" ".join(words), ())]
-    required = [word for one in own if one.required for word in value_of(one, folder)] + beside
+    required = required_by(words, folder)
     base = run([*words, *required], folder)
     found = {SHOWN: _shown(base), HANDED_ON: _texts(note for note in base if note[0] != SHOWN)}
-    names = {name for one in own for name in one.opts}
     with least_results():
-        asked = [[], ["--json"]] if "--json" in names else [[]]
+        asked = [[], ["--json"]] if any("--json" in one.opts for one in own) else [[]]
         found[LEAST] = [
             line for more in asked for line in _shown(run([*words, *required, *more], folder))
         ]
@@ -260,8 +264,7 @@ def wiring(words: tuple[str, ...], folder: Path) -> dict[str, list[str]]:
                 {text for text in _texts(base) if value in text.partition(" = ")[2]}
             )
             continue
-        needs = next((more for start, more in COMPANIONS if one.opts[0].startswith(start)), ())
-        with_it = _without(needs, one.opts[0], names, str(folder / "beside"))
+        with_it = companions(one, own, folder)
         if with_it not in bases:
             bases[with_it] = run([*words, *required, *with_it], folder)
             found[" ".join((WITH, *with_it[::2]))] = _moved(base, bases[with_it])
@@ -285,15 +288,36 @@ def _moved(before: list[tuple[str, str]], after: list[tuple[str, str]]) -> list[
     return added or sorted({f"no {path} = {text}" for path, text in set(before) - set(after)})
 
 
-def _without(needs: tuple[str, ...], option: str, names: set[str], file: str) -> tuple[str, ...]:
+def companions(option: Any, own: list[Any], folder: Path) -> tuple[str, ...]:
     """What an option needs, without itself and without options that the command does not have."""
-    pairs = zip(needs[::2], needs[1::2], strict=True)
+    name = option.opts[0]
+    needs = next((more for start, more in COMPANIONS if name.startswith(start)), ())
+    names = {name for one in own for name in one.opts} - {name}
     return tuple(
         word
-        for name, value in pairs
-        if name in names and name != option
-        for word in (name, file if value == "FILE" else value)
+        for needed, value in zip(needs[::2], needs[1::2], strict=True)
+        if needed in names
+        for word in (needed, str(folder / "beside") if value == "FILE" else value)
     )
+
+
+def required_by(words: tuple[str, ...], folder: Path) -> list[str]:
+    """Words that a command does nothing without, with the files that they name, in a new folder."""
+    (folder / "beside").write_text("")
+    (folder / "empty").mkdir()
+    beside = [str(folder / "beside") if w == "FILE" else w for w in BESIDE.get(" ".join(words), ())]
+    return [word for one in parameters(words) if one.required for word in value_of(one, folder)] + beside
+
+
+def limits(words: tuple[str, ...], folder: Path) -> Iterator[tuple[str, float, float, list[str]]]:
+    """Each option at each of its limits, but for defaults: a value between, the limit, and its notes."""
+    own, required = parameters(words), required_by(words, folder)
+    for one in own:
+        info = one.type_descriptor.parameter_info
+        for limit in {info.min, info.max} - {None, one.default}:
+            with_it = companions(one, own, folder)
+            notes = run([*words, *required, *with_it, one.opts[0], str(limit)], folder)
+            yield one.opts[0], float(value_of(one, folder)[-1]), limit, _texts(notes)
 
 
 if __name__ == "__main__":
