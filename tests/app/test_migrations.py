@@ -8,7 +8,6 @@ from contextlib import nullcontext
 
 import psycopg
 import pytest
-from alembic import command
 from alembic.config import Config
 from alembic.script import ScriptDirectory
 from pydantic import SecretStr
@@ -19,8 +18,6 @@ from amers.app.db.cluster import backup, embedded
 from amers.app.db.revisions import SchemaStatus
 from amers.app.errors import Conflict, InputError
 from amers.app.usecases.tokens import create_token, list_tokens
-from tests.app.catalogue import catalogue, row_counts
-from tests.app.store_commands import fill, register
 from tests.statements import run_sql
 
 TABLES = "select tablename from pg_tables where schemaname = 'public'"
@@ -36,10 +33,6 @@ OURS = {
     "registration",
     "measure",
 }
-
-
-OF_ROWS = {"0008", "0010"}
-"""Migrations that change rows, or build an index anew, and no definition."""
 
 
 def tables(dsn: str) -> set[str]:
@@ -87,42 +80,6 @@ def order_of(dsn: str) -> list[str]:
     """The revisions, the oldest first."""
     scripts = ScriptDirectory.from_config(alembic(dsn))
     return [one.revision for one in scripts.walk_revisions()][::-1]
-
-
-def test_every_migration_can_be_undone_one_step_at_a_time(empty_dsn):
-    """Each leaves what was there before it, to the last default, trigger and right."""
-    revisions.upgrade(empty_dsn)
-    command.downgrade(alembic(empty_dsn), "base")
-    assert tables(empty_dsn) <= {"alembic_version", "spatial_ref_sys"}
-    before = catalogue(empty_dsn)
-    for revision in order_of(empty_dsn):
-        command.upgrade(alembic(empty_dsn), revision)
-        after = catalogue(empty_dsn)
-        assert (after != before) == (revision not in OF_ROWS), revision
-        command.downgrade(alembic(empty_dsn), "-1")
-        assert catalogue(empty_dsn) == before, revision
-        command.upgrade(alembic(empty_dsn), revision)
-        assert catalogue(empty_dsn) == after, revision
-        before = after
-    assert revisions.status(empty_dsn).current
-
-
-@pytest.mark.long
-def test_migrations_are_undone_with_rows_of_every_kind(empty_dsn, tmp_path):
-    """Down to the first and up again: what both schemas have keeps its rows."""
-    revisions.upgrade(empty_dsn)
-    fill(empty_dsn, tmp_path, points=100, size=1200)
-    register(empty_dsn, tmp_path)
-    newest, counts = catalogue(empty_dsn), row_counts(empty_dsn)
-    assert {name for name, count in counts.items() if count} >= OURS - {"job", "scene"}
-    for revision in order_of(empty_dsn)[-2::-1]:
-        command.downgrade(alembic(empty_dsn), revision)
-        kept = row_counts(empty_dsn)
-        assert {name: counts[name] for name in kept if name in counts} == kept, revision
-    command.upgrade(alembic(empty_dsn), "head")
-    assert catalogue(empty_dsn) == newest
-    again = row_counts(empty_dsn)
-    assert {name: again[name] for name in kept} == kept
 
 
 def test_the_names_of_the_files_give_the_order_that_alembic_keeps(empty_dsn):

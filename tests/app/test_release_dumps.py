@@ -4,6 +4,7 @@ import gzip
 import hashlib
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -41,16 +42,23 @@ MOMENT = re.compile(r"(\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d\.\d+)(?=\+00)")
 Counts = dict[str, int]
 
 
-@pytest.fixture(scope="module", params=DUMPS, ids=lambda path: path.name.split(".")[0])
-def upgraded(cluster: Cluster, request: pytest.FixtureRequest) -> Iterator[tuple[str, Counts, Counts]]:
-    """The connection string of an upgraded dump, and how many rows its tables had before and after."""
+@contextmanager
+def restored(cluster: Cluster, path: Path) -> Iterator[str]:
+    """The connection string of a dump in a database of its own."""
     with fresh_database(cluster, EMPTY_TEMPLATE) as dsn:
         # As in the private cluster of a release before roles: a superuser owns all of it.
         name = database_name(dsn)
         with psycopg.connect(cluster.dsn(name, SUPERUSER)) as connection:
-            connection.execute(as_if_made_now(request.param).encode())
+            connection.execute(as_if_made_now(path).encode())
         cluster.hand_over(name)
-        assert revisions.status(dsn).found == request.param.name.split(".")[0]
+        assert revisions.status(dsn).found == path.name.split(".")[0]
+        yield dsn
+
+
+@pytest.fixture(scope="module", params=DUMPS, ids=lambda path: path.name.split(".")[0])
+def upgraded(cluster: Cluster, request: pytest.FixtureRequest) -> Iterator[tuple[str, Counts, Counts]]:
+    """The connection string of an upgraded dump, and how many rows its tables had before and after."""
+    with restored(cluster, request.param) as dsn:
         before = counts(dsn)
         revisions.upgrade(dsn)
         yield dsn, before, counts(dsn)
