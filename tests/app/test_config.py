@@ -16,29 +16,6 @@ def _no_settings(monkeypatch):
         monkeypatch.delenv(f"AMERS_{name.upper()}", raising=False)
 
 
-def test_every_setting_has_a_default():
-    settings = read_settings()
-    assert settings.database_url is None
-    assert not settings.public_points
-
-
-def test_a_variable_sets_the_setting_of_its_name(monkeypatch):
-    monkeypatch.setenv("AMERS_PUBLIC_POINTS", "true")
-    monkeypatch.setenv("AMERS_PORT", "8123")
-    settings = read_settings()
-    assert settings.public_points
-    assert settings.port == 8123
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("PORT", "no"), ("JOB_SECONDS", "-1"), ("PUBLIC_POINTS", "perhaps")]
-)
-def test_a_wrong_value_is_refused_by_the_name_of_its_variable(monkeypatch, name, value):
-    monkeypatch.setenv(f"AMERS_{name}", value)
-    with pytest.raises(InputError, match=f"AMERS_{name}"):
-        read_settings()
-
-
 def test_the_password_of_the_database_is_not_shown():
     settings = Settings(database_url="postgresql://amers:hush@db/amers")
     assert "hush" not in repr(settings)
@@ -103,7 +80,8 @@ def test_rights_of_an_issuer_have_the_names_of_the_scopes_that_they_grant():
 
 
 LIMITS = [
-    ("PORT", ("1", "65535"), ("0", "65536")),
+    ("PORT", ("1", "65535"), ("0", "65536", "no")),
+    ("PUBLIC_POINTS", ("true", "false"), ("perhaps",)),
     ("POOL_SIZE", ("1", "100"), ("0", "101")),
     ("UPLOAD_LIMIT_BYTES", ("1",), ("0", "1.5")),
     ("BODY_LIMIT_BYTES", ("1",), ("0",)),
@@ -135,7 +113,27 @@ LIMITS = [
     ),
     ("TRUSTED_PROXIES", ("10.0.0.5,10.1.0.0/24", ""), ("10.1.0.1/24", "proxy")),
     ("QUOTA_CPU_SECONDS", ("0.001",), ("0",)),
-    ("MAP_BACKGROUND", ("/{z}/{x}/{y}",), ("", "http://a.example/{z}/{x}/{y}", "https:/{z}/{x}/{y}")),
+    (
+        "MAP_BACKGROUND",
+        (
+            "/{z}/{x}/{y}",
+            "https://tiles.example/{z}/{x}/{y}.png",
+            "https://tiles.example:8443/wmts?layer=a&TileMatrix={z}&TileCol={x}&TileRow={y}",
+            "/tiles/{z}/{y}/{x}.jpg",
+        ),
+        (
+            "",
+            "http://a.example/{z}/{x}/{y}",
+            "https:/{z}/{x}/{y}",
+            "//tiles.example/{z}/{x}/{y}.png",
+            "https://tiles.example/{z}/{x}.png",
+            "https://tiles.example/{z}/{x}/{y}/{token}",
+            "https://tiles.example; script-src */{z}/{x}/{y}",
+            "https://tiles.example/{z}/{x}/{y}.png; script-src *",
+            "https://user@tiles.example/{z}/{x}/{y}",
+            "javascript:alert(1)//{z}/{x}/{y}",
+        ),
+    ),
     ("MAP_BACKGROUND_ATTRIBUTION", ("x", "x" * 200), ("", " ", "x" * 201)),
     ("OIDC_SCOPES", ('{"all": "admin"}', "{}"), ('{"all": "root"}', "{")),
     ("LOG_FORMAT", ("text", "json"), ("xml", "")),
@@ -167,47 +165,9 @@ def test_a_setting_is_accepted_up_to_its_limits_and_refused_beyond(monkeypatch, 
             read_settings()
 
 
-@pytest.mark.parametrize(
-    "address",
-    [
-        "https://tiles.example/{z}/{x}/{y}.png",
-        "https://tiles.example:8443/wmts?layer=a&TileMatrix={z}&TileCol={x}&TileRow={y}",
-        "/tiles/{z}/{y}/{x}.jpg",
-    ],
-)
-def test_a_background_lies_on_a_site_with_encryption_or_on_this_one(monkeypatch, address):
-    monkeypatch.setenv("AMERS_MAP_BACKGROUND", address)
-    monkeypatch.setenv("AMERS_MAP_BACKGROUND_ATTRIBUTION", "its makers")
-    assert read_settings().map_background == address
-
-
-@pytest.mark.parametrize(
-    "address",
-    [
-        "",
-        "http://tiles.example/{z}/{x}/{y}.png",
-        "//tiles.example/{z}/{x}/{y}.png",
-        "https://tiles.example/{z}/{x}.png",
-        "https://tiles.example/{z}/{x}/{y}/{token}",
-        "https://tiles.example; script-src */{z}/{x}/{y}",
-        "https://tiles.example/{z}/{x}/{y}.png; script-src *",
-        "https://user@tiles.example/{z}/{x}/{y}",
-        "javascript:alert(1)//{z}/{x}/{y}",
-    ],
-)
-def test_a_background_elsewhere_or_with_anything_else_in_its_address_is_refused(monkeypatch, address):
-    monkeypatch.setenv("AMERS_MAP_BACKGROUND", address)
-    monkeypatch.setenv("AMERS_MAP_BACKGROUND_ATTRIBUTION", "its makers")
-    with pytest.raises(InputError, match="AMERS_MAP_BACKGROUND"):
-        read_settings()
-
-
 def test_a_background_without_the_name_of_its_makers_is_refused(monkeypatch):
     monkeypatch.setenv("AMERS_MAP_BACKGROUND", "https://tiles.example/{z}/{x}/{y}.png")
     with pytest.raises(InputError, match="needs AMERS_MAP_BACKGROUND_ATTRIBUTION"):
-        read_settings()
-    monkeypatch.setenv("AMERS_MAP_BACKGROUND_ATTRIBUTION", " ")
-    with pytest.raises(InputError, match="AMERS_MAP_BACKGROUND_ATTRIBUTION"):
         read_settings()
 
 
@@ -230,6 +190,8 @@ SITES = (" https://a.example , ,https://b.example,", ("https://a.example", "http
         ("TRUSTED_PROXIES", " 10.0.0.5 ,,10.1.0.0/24,", ("10.0.0.5/32", "10.1.0.0/24")),
         ("OIDC_SCOPES", '{"gcp:all": "admin"}', {"gcp:all": "admin"}),
         ("PUBLIC_URL", " ", None),
+        ("PUBLIC_POINTS", "true", True),
+        ("PORT", "8123", 8123),
     ],
 )
 def test_a_value_is_read_as_what_it_stands_for(monkeypatch, name, value, read):
