@@ -2,10 +2,11 @@
 
 import json
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import islice
 from threading import Thread
+from types import SimpleNamespace
 
 import pytest
 
@@ -76,10 +77,25 @@ def test_a_refusal_that_will_stay_ends_the_waiting_at_once(status):
         client.wait(RUNNING, timeout_s=long_enough_s)
 
 
-def test_an_outage_that_lasts_ends_the_waiting(monkeypatch):
-    monkeypatch.setattr(client_module, "OUTAGE_S", 0.0)
-    with service(503) as client, pytest.raises(ServiceFailure, match="not now"):
-        client.wait(RUNNING, timeout_s=long_enough_s)
+@pytest.mark.parametrize(("answers", "ends"), [("-r-r-r-s", True), ("r--s", False), ("--s", False)])
+def test_an_outage_that_lasts_from_the_last_answer_on_ends_the_waiting(monkeypatch, answers, ends):
+    """Polls are as far apart as the longest outage: one without an answer is waited for, two are not."""
+    now_s, client, left = [0.0], Client("http://amers.invalid"), iter(answers)
+
+    def job(_id: str) -> Job:
+        answer = next(left)
+        if answer == "-":
+            raise ServiceFailure("not now")
+        return RUNNING if answer == "r" else Job.of(ENDED)
+
+    def sleep(seconds: float) -> None:
+        now_s[0] += seconds
+
+    monkeypatch.setattr(client, "job", job)
+    monkeypatch.setattr(client_module, "POLL_S", client_module.OUTAGE_S)
+    monkeypatch.setattr(client_module, "time", SimpleNamespace(monotonic=lambda: now_s[0], sleep=sleep))
+    with nullcontext() if ends else pytest.raises(ServiceFailure, match="not now"):
+        assert client.wait(RUNNING).status == "successful"
 
 
 @pytest.mark.parametrize("form", ["features", "csv"])

@@ -1,5 +1,6 @@
 """What a command ends with: a table of outcomes times commands."""
 
+import contextlib
 import errno
 from collections.abc import Iterator
 from pathlib import Path
@@ -154,12 +155,16 @@ def test_what_is_found_decides_how_a_command_ends(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    words = command.split()
-    given = [
-        word for one in parameters(tuple(words)) if one.required for word in value_of(one, tmp_path)
-    ]
+    """Alone, and with each of its options."""
+    own = parameters(tuple(command.split()))
+    given = [word for one in own if one.required for word in value_of(one, tmp_path)]
+    given += ["--points-per-km2", "1"] if command == "block quality" else []
     Recorders(monkeypatch, PACKAGE, (f"{PACKAGE}failures", f"{PACKAGE}exit_status"))
     monkeypatch.setattr(f"{PACKAGE}{function}", lambda *_arguments, **_named: result)
     monkeypatch.setattr(f"{PACKAGE}block_quality._show_report", lambda *_arguments, **_named: None)
-    more = ["--points-per-km2", "1"] if command == "block quality" else []
-    assert (app([*words, *given, *more], prog_name="amers", standalone_mode=False) or 0) == status
+    monkeypatch.setattr(f"{PACKAGE}output._as_json", str)
+    for option in ([], *(value_of(one, tmp_path) for one in own if not one.required)):
+        words = [*command.split(), *given, *option]
+        # Some options are refused without others.
+        with contextlib.suppress(errors.InputError):
+            assert (app(words, prog_name="amers", standalone_mode=False) or 0) == status, option

@@ -18,6 +18,7 @@ from tests.app.running_service import Served, service_with_a_block
 from tests.service_process import free_port
 
 EVERYTHING = ("--bbox", "5,43,6,44")
+SOME = ("--bbox", "5,43,5.25,44")
 NOTHING = ("--bbox", "0,0,1,1")
 points_of_the_block = 60
 
@@ -54,11 +55,14 @@ def test_the_service_gives_the_points_that_its_store_gives(run, served):
         assert sent == stored
 
 
-@pytest.mark.parametrize("box", [EVERYTHING, NOTHING], ids=["60 points", "none"])
-def test_the_rows_of_the_service_are_those_of_its_store(run, served, box):
-    form = ("--format", "csv")
-    of_store, of_service = (run(*box, *form, *more) for more in ((), ("--server", served.url)))
-    assert list(csv.DictReader(io.StringIO(of_service))) == list(csv.DictReader(io.StringIO(of_store)))
+@pytest.mark.parametrize("box", [EVERYTHING, SOME, NOTHING], ids=["60 points", "some", "none"])
+def test_the_rows_of_the_service_are_those_of_its_store_and_as_many_as_it_counts(run, served, box):
+    found = []
+    for more in ((), ("--server", served.url)):
+        found.append(list(csv.DictReader(io.StringIO(run(*box, "--format", "csv", *more)))))
+        assert json.loads(run(*box, "--json", *more))["points"] == len(found[-1])
+    assert found[0] == found[1]
+    assert (0 < len(found[0]) < points_of_the_block) == (box == SOME)
 
 
 def test_a_box_without_points_is_an_empty_collection(run, served):
@@ -66,11 +70,11 @@ def test_a_box_without_points_is_an_empty_collection(run, served):
 
 
 def test_the_number_of_points_of_a_service_and_a_file_of_them(run, served, tmp_path):
-    service = ("--server", served.url)
-    number = json.loads(run(*EVERYTHING, *service, "--json"))
+    service = ("--server", served.url, "--json")
+    number = json.loads(run(*EVERYTHING, *service))
     assert number == {"points": points_of_the_block, "exact": True, "file": None}
     file = tmp_path / "points.geojson"
-    written = json.loads(run(*EVERYTHING, *service, "--json", "-o", str(file)))
+    written = json.loads(run(*EVERYTHING, *service, "-o", str(file)))
     assert written == {"file": str(file), "size_bytes": file.stat().st_size}
     assert len(json.loads(file.read_text())["features"]) == points_of_the_block
 
