@@ -201,6 +201,8 @@ ARRIVE_AS = {
     "gsds_m[1]": "coarse_gsd_m",
 }
 """Names, or places, under which options arrive that are neither their own nor its end."""
+NOT_HERE = {"progress", "registered", "sigma_px"}
+"""Options that other tests have: they change what is called, or what marks state."""
 
 
 def handed_on(
@@ -229,6 +231,9 @@ def handed_on(
 
 @pytest.mark.parametrize("name", OPTIONS)
 def test_an_option_arrives_under_its_name(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    parameters = inspect.signature(getattr(amers, name)).parameters.values()
+    options = {one.name for one in parameters if one.kind is one.KEYWORD_ONLY}
+    assert options - OPTIONS[name][1].keys() <= NOT_HERE
     monkeypatch.chdir(tmp_path)
     notes = handed_on(name, {}, monkeypatch)
     for option, given in OPTIONS[name][1].items():

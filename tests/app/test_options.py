@@ -201,7 +201,7 @@ def test_a_folder_of_intermediate_results_may_be_new():
     assert not any(one.type_descriptor.parameter_info.exists for one in made)
 
 
-class Asked(Exception):
+class HandedOn(Exception):
     """Carries what a command asks for, in place of the work."""
 
 
@@ -209,12 +209,12 @@ def asked(words: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
     """What a command on scenes hands on to be registered."""
 
     def note(*given: Any) -> None:
-        raise Asked(*given)
+        raise HandedOn(*given)
 
     monkeypatch.setattr(scene, "check_map", lambda _image: None)
     monkeypatch.setattr(scene, "register_scenes", note)
     monkeypatch.setattr(scenes_together, "register_together", note)
-    with pytest.raises(Asked) as found:
+    with pytest.raises(HandedOn) as found:
         app(words, standalone_mode=False)
     return found.value.args
 
