@@ -15,6 +15,7 @@ from amers.app.cli.production_rows import accuracy_row, effort_row
 from amers.app.cli.progress import shown_progress
 from amers.app.cli.transaction import transaction
 from amers.app.config import Settings, read_settings
+from amers.app.errors import InputError
 from amers.app.storage import Storage, open_storage
 from amers.app.usecases import storage_identity
 from amers.app.usecases.base.made import MadeBase, report_folder
@@ -95,6 +96,10 @@ def make(
     as_json: AsJson = False,
 ) -> None:
     """Make a base of control points for a region from an open archive of images."""
+    if vertical is not None and dem is None:
+        raise InputError(
+            "--vertical: given without --dem, to which it belongs; add --dem FILE, or leave it out"
+        )
     terrain = None if dem is None else TerrainFile(dem, vertical, geoid)
     request = BaseRequest(source, tuple(catalogue), area, bbox, scene, terrain, geoid, since)
     if only_plan:

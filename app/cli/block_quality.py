@@ -1,20 +1,19 @@
 """`amers block quality`: the quality of a block of the store, or of a folder, against references."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from amers.app.cli.exit_status import NO_RESULT
-from amers.app.cli.options import FromMilli, Shown
+from amers.app.cli.options import FromMilli, Shown, refuse_alone
 from amers.app.cli.output import AsJson, Row, print_json, show_one, show_statements
 from amers.app.cli.progress import shown_progress
 from amers.app.cli.terrain_options import TerrainOptions
 from amers.app.cli.transaction import transaction
 from amers.app.config import read_settings
 from amers.app.db.engine import opened
-from amers.app.errors import InputError
 from amers.app.usecases import storage_identity
 from amers.app.usecases.blocks import lifecycle
 from amers.app.usecases.blocks.quality import (
@@ -80,22 +79,18 @@ class HeightOptions(TerrainOptions):
         """The heights; None without --dem.
 
         Raises:
-            InputError: something is stated of heights that are not given.
+            InputError: an option belongs to --dem, which is not given.
         """
-        if self.terrain is not None:
-            return HeightFiles(
-                self.terrain,
-                self.dem_sigma_m,
-                self.dem_frame_sigma_m,
-                self.exclude_heights,
-                self.land_cover,
-            )
-        if self.exclude_heights or self.land_cover or self.vertical or self.geoid:
-            raise InputError(
-                "--exclude-heights, --land-cover, --vertical, --geoid: given without --dem, whose "
-                "heights they describe; add --dem FILE, or leave them out"
-            )
-        return None
+        refuse_alone("dem", self, *(one.name for one in fields(self) if one.name != "dem"))
+        if self.terrain is None:
+            return None
+        return HeightFiles(
+            self.terrain,
+            self.dem_sigma_m,
+            self.dem_frame_sigma_m,
+            self.exclude_heights,
+            self.land_cover,
+        )
 
 
 def quality(

@@ -1,16 +1,29 @@
 """The options that state the control of a block, and the marks that a scene is registered on."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
-from amers.app.cli.options import FromMilli, GeoidFile, Places, option_name
+from amers.app.cli.options import FromMilli, GeoidFile, Places, refuse_alone
 from amers.app.cli.point_statements import sigma_pair, stated_by_caller
-from amers.app.errors import InputError
 from amers.app.usecases.control_files import ControlFiles, HeightFile
 from amers.app.usecases.marked_files import PointStatements
 from amers.app.usecases.registration.control_marks import MarkFiles
 from amers.app.usecases.terrain_file import TerrainFile
 from amers.services.formats.pieces import source_of
+
+_OF_POINTS = (
+    "control_sigma_m",
+    "control_frame_sigma_m",
+    "control_mark_sigma_px",
+    "control_vertical",
+    "control_geoid",
+    "control_crs",
+    "control_columns",
+    "control_sigma_axes",
+)
+"""Options that describe --control."""
+_OF_HEIGHTS = ("control_dem_vertical", "control_dem_geoid", "control_dem_sigma_m")
+"""Options that describe --control-dem."""
 
 
 @dataclass(frozen=True)
@@ -62,27 +75,20 @@ class MarkOptions:
         Raises:
             InputError: a value is wrong, or states something of a file that is not given.
         """
-        if self.control:
-            terrain = None
-            if self.control_dem:
-                terrain = TerrainFile(
-                    source_of(self.control_dem),
-                    self.control_dem_vertical,
-                    self.control_dem_geoid,
-                    geoid_option="--control-dem-geoid",
-                )
-            statements = _point_statements(self)
-            return MarkFiles(self.control, statements, terrain, self.control_dem_sigma_m, of_many)
-        alone = [
-            option_name(field.name)
-            for field in fields(self)
-            if field.name != "control" and getattr(self, field.name) not in (None, ())
-        ]
-        if alone:
-            raise InputError(
-                f"{', '.join(alone)}: given without --control; add --control FILE, or leave this out"
+        refuse_alone("control", self, *_OF_POINTS, "control_dem", *_OF_HEIGHTS)
+        refuse_alone("control_dem", self, *_OF_HEIGHTS)
+        if not self.control:
+            return None
+        terrain = None
+        if self.control_dem:
+            terrain = TerrainFile(
+                source_of(self.control_dem),
+                self.control_dem_vertical,
+                self.control_dem_geoid,
+                geoid_option="--control-dem-geoid",
             )
-        return None
+        statements = _point_statements(self)
+        return MarkFiles(self.control, statements, terrain, self.control_dem_sigma_m, of_many)
 
 
 @dataclass(frozen=True)
@@ -140,8 +146,9 @@ class ControlOptions:
         Raises:
             InputError: a value is wrong, or states something of a file that is not given.
         """
-        self._refuse_alone("control_dem", "vertical", "geoid", "sigma_m", "frame_sigma_m")
-        self._refuse_alone("control_ortho", "sigma_m")
+        refuse_alone("control", self, *_OF_POINTS)
+        refuse_alone("control_dem", self, *_OF_HEIGHTS, "control_dem_frame_sigma_m")
+        refuse_alone("control_ortho", self, "control_ortho_sigma_m")
         return ControlFiles(
             self.control,
             _point_statements(self),
@@ -162,16 +169,6 @@ class ControlOptions:
         )
         frame_sigma_m = sigma_pair(self.control_dem_frame_sigma_m, "--control-dem-frame-sigma-m")
         return HeightFile(terrain, self.control_dem_sigma_m, frame_sigma_m)
-
-    def _refuse_alone(self, file: str, *statements: str) -> None:
-        """Refuse options that state something of a file which is not given."""
-        names = [f"{file}_{statement}" for statement in statements]
-        alone = [option_name(name) for name in names if getattr(self, name) is not None]
-        if alone and not getattr(self, file):
-            raise InputError(
-                f"{', '.join(alone)}: given without {option_name(file)}; add {option_name(file)}, "
-                "or leave this out"
-            )
 
 
 def _point_statements(options: MarkOptions | ControlOptions) -> PointStatements:

@@ -15,6 +15,7 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 import typer
 from typer.models import ArgumentInfo, OptionInfo
 
+from amers.app.errors import InputError
 from amers.services.docstrings import attribute_descriptions
 
 FromMilli = Annotated[float | None, typer.Option(min=0.001)]
@@ -86,6 +87,27 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
 def option_name(field: str) -> str:
     """The option of a field of this name."""
     return f"--{field.replace('_', '-')}"
+
+
+def refuse_alone(file: str, options: Any, *statements: str) -> None:
+    """Refuse options that belong to a file which is not given.
+
+    Args:
+        file: field of the file, or of the files.
+        options: object with this field.
+        statements: fields of the same object that describe the file, or are of no use without it.
+
+    Raises:
+        InputError: one of them is given without the file.
+    """
+    alone = [option_name(name) for name in statements if getattr(options, name) not in (None, ())]
+    if alone and not getattr(options, file):
+        name = option_name(file)
+        belong, them = ("it belongs", "it") if len(alone) == 1 else ("they belong", "them")
+        raise InputError(
+            f"{', '.join(alone)}: given without {name}, to which {belong}; add {name} FILE, or leave "
+            f"{them} out"
+        )
 
 
 def words_of(options: Any) -> list[str]:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from amers.app.cli.options import GeoidFile, Places, Shown
+from amers.app.cli.options import GeoidFile, Places, Shown, refuse_alone
 from amers.app.cli.output import AsJson, show_one
 from amers.app.cli.point_statements import sigma_pair, stated_by_caller
 from amers.app.cli.production_rows import accuracy_row, agreement_row, sampling_pair
@@ -64,7 +64,12 @@ class StatementOptions:
 
     @property
     def terrain(self) -> TerrainFile | None:
-        """The heights of points without any; None without --dem."""
+        """The heights of points without any; None without --dem.
+
+        Raises:
+            InputError: an option belongs to --dem, which is not given.
+        """
+        refuse_alone("dem", self, "dem_vertical", "dem_geoid")
         if not self.dem:
             return None
         return TerrainFile(

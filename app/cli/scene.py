@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from amers.app.cli.control_options import MarkOptions
-from amers.app.cli.options import FromMilli, GeoidFile, Places, words_of
+from amers.app.cli.options import FromMilli, GeoidFile, Places, refuse_alone, words_of
 from amers.app.cli.output import AsJson
 from amers.app.cli.scene_registration import (
     Control,
@@ -64,25 +64,17 @@ class ControlOptions:
         """The block, the reference, and the marks of a person.
 
         Raises:
-            InputError: something is stated of a reference that is not given, or it is not on a map.
+            InputError: an option belongs to a file that is not given, or the reference is not on a map.
         """
-        sigmas_m = (self.reference_sigma_m, self.reference_sigma_up_m)
+        refuse_alone("reference", self, "dem", "reference_sigma_m", "reference_sigma_up_m")
+        refuse_alone("dem", self, "vertical", "geoid")
         if not self.reference:
-            if self.dem:
-                raise InputError(
-                    "--dem: given without --reference, whose heights it contains; add --reference "
-                    "ORTHO, or leave --dem out"
-                )
-            if sigmas_m != (None, None):
-                raise InputError(
-                    "--reference-sigma-m, --reference-sigma-up-m: given without --reference, whose "
-                    "accuracy they state; add --reference ORTHO, or leave them out"
-                )
             return Control(self.block, None, marks)
         image = source_of(self.reference)
         check_map(image)
         terrain = TerrainFile(source_of(self.dem), self.vertical, self.geoid) if self.dem else None
-        return Control(self.block, ReferenceFiles(image, terrain, *sigmas_m), marks)
+        reference = ReferenceFiles(image, terrain, self.reference_sigma_m, self.reference_sigma_up_m)
+        return Control(self.block, reference, marks)
 
 
 @dataclass(frozen=True)
@@ -174,7 +166,7 @@ class WorkOptions:
             raise InputError(
                 "--jobs: the workers of the service do the jobs; leave it out with --server"
             )
-        return Remote(self.server, self.token or "") if self.server else None
+        return Remote(self.server, self.token or "")
 
 
 def register(

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from amers.app.cli.options import FromMilli, GeoidFile, Places, Shown
+from amers.app.cli.options import FromMilli, GeoidFile, Places, Shown, refuse_alone
 from amers.app.cli.output import AsJson, print_json, show, show_statements
 from amers.app.cli.point_intersection import GroundStatements
 from amers.app.cli.point_statements import sigma_pair, stated_by_caller
@@ -52,7 +52,12 @@ class TieHeights:
 
     @property
     def heights(self) -> SiteHeights | None:
-        """The heights; None without --dem."""
+        """The heights; None without --dem.
+
+        Raises:
+            InputError: an option belongs to --dem, which is not given.
+        """
+        refuse_alone("dem", self, "dem_vertical", "dem_geoid", "dem_sigma_m", "dem_frame_sigma_m")
         if not self.dem:
             return None
         source = source_of(self.dem)

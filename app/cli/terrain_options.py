@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from amers.app.cli.options import GeoidFile, Places
+from amers.app.cli.options import GeoidFile, Places, refuse_alone
 from amers.app.usecases.terrain_file import TerrainFile
 from amers.services.formats.pieces import source_of
 
@@ -27,7 +27,12 @@ class TerrainOptions:
 
     @property
     def terrain(self) -> TerrainFile | None:
-        """The terrain; None without --dem."""
+        """The terrain; None without --dem.
+
+        Raises:
+            InputError: an option belongs to --dem, which is not given.
+        """
+        refuse_alone("dem", self, "vertical", "geoid")
         return TerrainFile(source_of(self.dem), self.vertical, self.geoid) if self.dem else None
 
 

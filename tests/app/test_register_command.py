@@ -309,7 +309,7 @@ def test_the_command_lets_a_service_register(
     [
         (("--reference", "land.tif"), "--server: the service uses its own"),
         (("--block", "folder"), "--server: the service uses its own"),
-        (("--dem", "heights.tif"), "--dem: given without --reference, whose heights it contains"),
+        (("--dem", "heights.tif"), "--dem: given without --reference, to which it belongs"),
     ],
 )
 def test_a_service_uses_its_own_points_and_references(

@@ -147,7 +147,7 @@ def test_several_files_are_one_set_of_marks(image):
     [
         (
             ["--control-sigma-m", "3,5"],
-            "--control-sigma-m: given without --control; add --control FILE, or leave this out",
+            "--control-sigma-m: given without --control, to which it belongs; add --control FILE",
         ),
         (
             ["--control", "MARKS", "--server", "http://localhost", "--control-crs", "EPSG:32631"],

@@ -10,11 +10,30 @@ from pathlib import Path
 
 import pytest
 
-from tests.app.wiring import GOLDEN, NO_OPTIONS, commands, limits, wiring
+from tests.app.wiring import GOLDEN, NO_OPTIONS, commands, limits, refusals, wiring
 
 EXPECTED = json.loads(GOLDEN.read_text())
 UNITS = {1.0, 0.01, 1000.0}
 """By what options are multiplied: none, per cent, and kilometres in metres."""
+OF_USE_ALONE = {
+    "base make --geoid",
+    "points intersect --geoid",
+    "points experiment --geoid",
+    "points reach --vertical",
+    "points reach --geoid",
+    "production points --vertical",
+    "production points --geoid",
+    "scene register --reference",
+    "production run --control-ortho",
+    "production run --control-dem",
+    # What a use case is given, it checks.
+    "reference add --vertical",
+    "reference add --geoid",
+    # A variable of the environment gives it to all commands.
+    "points query --token",
+    "scene register --token",
+}
+"""Options that need no other one, or not always."""
 NOWHERE = 10
 """Options, of 439, whose way is not seen so: they need others in a way of their own, or what they are
 given to is a result, for which nothing stands in. The number may not grow."""
@@ -40,6 +59,16 @@ def test_an_option_at_its_limit_arrives_where_one_between_its_limits_does(
                     if note.startswith(f"{path} = ")
                 ]
                 assert found == [pytest.approx(share * limit)], (option, limit)
+
+
+@pytest.mark.parametrize("words", list(commands()), ids=" ".join)
+def test_an_option_that_belongs_to_another_one_is_refused_without_it(
+    words: tuple[str, ...], tmp_path: Path
+) -> None:
+    for option, others, reason in refusals(words, tmp_path):
+        if f"{' '.join(words)} {option}" not in OF_USE_ALONE:
+            sentences = [f"{option}: given without {one}, to which it belongs" for one in others]
+            assert reason.startswith(tuple(sentences)), (option, reason)
 
 
 def number(text: str) -> float:

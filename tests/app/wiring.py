@@ -21,6 +21,7 @@ from typing import Any
 from uuid import UUID
 
 import pytest
+from click.testing import Result
 from typer.testing import CliRunner
 
 from amers.app.cli.commands import COMMANDS
@@ -28,6 +29,7 @@ from amers.app.cli.main import app
 from amers.app.cli.on_demand import Group, Tree, _load
 from amers.app.cli.supervisor import Supervisor
 from amers.app.client import Client
+from amers.app.errors import InputError
 from amers.app.request_context import Origin
 from tests.app.recorders import Recorders
 from tests.app.stand_ins import Anything, _AnyText, least_results
@@ -195,23 +197,41 @@ def _file(parameter: Any, folder: Path) -> Path:
 
 def run(words: list[str], folder: Path) -> list[tuple[str, str]]:
     """What a command hands on, without the names of temporary folders."""
+    notes, result = _invoked(words, folder)
+    if result is not None:
+        notes += [(SHOWN, line.rstrip()) for line in result.stdout.splitlines()]
+        aside = result.stderr.splitlines() if "Usage: " not in result.stderr else []
+        notes += [(SHOWN, f"{ASIDE}{line.rstrip()}") for line in aside]
+        notes.append(("exit status", str(result.exit_code)))
+    return [
+        (path, _OF_THIS_RUN.sub("", text.replace(str(folder), "FOLDER").replace(_USER, "USER")))
+        for path, text in notes
+    ]
+
+
+def refusals(words: tuple[str, ...], folder: Path) -> Iterator[tuple[str, tuple[str, ...], str]]:
+    """Each option that belongs to others, those, and why it is refused alone; empty if it is not."""
+    own, required = parameters(words), required_by(words, folder)
+    for one in own:
+        needed = companions(one, own, folder)[::2]
+        if needed and not {one.opts[0], *needed} & set(required):
+            _, result = _invoked([*words, *required, *value_of(one, folder)], folder)
+            reason = None if result is None else result.exception
+            yield one.opts[0], needed, str(reason) if isinstance(reason, InputError) else ""
+
+
+def _invoked(words: list[str], folder: Path) -> tuple[list[tuple[str, str]], Result | None]:
+    """What a command hands on to recorders, and how it ends."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setenv("AMERS_DATA_FOLDER", str(folder / "kept"))
         monkeypatch.chdir(folder / "empty")
         recorders = Recorders(monkeypatch, PACKAGE)
         _record_service(recorders, monkeypatch)
         monkeypatch.setattr(_AnyText, "asked", staticmethod(recorders.note))
+        result = None
         with contextlib.suppress(Exception):
             result = CliRunner().invoke(app, words)
-            recorders.notes += [(SHOWN, line.rstrip()) for line in result.stdout.splitlines()]
-            aside = result.stderr.splitlines() if "Usage: " not in result.stderr else []
-            recorders.notes += [(SHOWN, f"{ASIDE}{line.rstrip()}") for line in aside]
-            recorders.notes.append(("exit status", str(result.exit_code)))
-    plain = [
-        (path, _OF_THIS_RUN.sub("", text.replace(str(folder), "FOLDER").replace(_USER, "USER")))
-        for path, text in recorders.notes
-    ]
-    return plain
+        return recorders.notes, result
 
 
 def _record_service(recorders: Recorders, monkeypatch: pytest.MonkeyPatch) -> None:
