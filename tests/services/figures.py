@@ -70,7 +70,7 @@ def _parts(value: object, left_out: Collection[str]) -> Mapping[str, object]:
 def _of_array(values: np.ndarray) -> Iterator[float | str]:
     yield "x".join(map(str, values.shape))
     if values.dtype.kind not in "biuf":
-        yield from (str(one) for one in np.unique(values))
+        yield from sorted({str(one) for one in values.ravel()})
         return
     columns = values.astype(np.float64)
     columns = columns.reshape(-1, values.shape[-1] if values.ndim > 1 and values.shape[-1] <= 3 else 1)
