@@ -9,8 +9,6 @@ from amers.services.errors import NoConsensus
 from amers.services.geodesy import move_metres
 from amers.services.types import Array, Frame
 
-pytestmark = pytest.mark.thorough
-
 BEFORE = Frame(np.diag([5.0, 4.0, 8.0]) ** 2)
 SOURCE = Frame.from_sigmas(0.3, 0.5)
 KNOWN_M = np.array([0.2, 0.2, 0.4])
@@ -41,6 +39,7 @@ def drawn(
     return fit_frame(BEFORE, control, found, own), frame_m
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 @pytest.mark.parametrize("wrong", [pytest.param(0, marks=pytest.mark.endurance), 3])
 def test_the_frame_is_as_accurate_as_it_states_and_wrong_ground_leaves(wrong: int) -> None:

@@ -20,8 +20,6 @@ from benchmarks.block_coverage import SHIFT_PX, Case, draw, whitened_square
 from tests.services.conftest import SHAPE, FlatModel
 from tests.services.ties import difference_m
 
-pytestmark = pytest.mark.thorough
-
 TRIALS = 10
 POINT_SIGMA_M, FRAME_SIGMA_M = 0.3, 0.8
 SEAMS = {"star": ([0, 1, 2, 3, 4], [0, 3, 4, 5, 6]), "strip": ([*range(9)], [*range(6, 16)])}
@@ -111,6 +109,7 @@ def total_covariance(block: BlockAdjustment, names: Sequence[str], move: Array) 
     return block.known.take(rows).relative + move @ block.known.frame.covariance_m2 @ move.T
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 @pytest.mark.parametrize("layout", ["star", "strip"])
 def test_the_frame_of_a_neighbour_carries_over_and_covers_the_truth(layout) -> None:

@@ -21,8 +21,6 @@ from tests.services.misfit.test_displacement_components import (
     trial,
 )
 
-pytestmark = pytest.mark.thorough
-
 SIGMA_PX = 0.5
 
 
@@ -146,6 +144,7 @@ def test_chips_that_are_the_same_can_be_compared():
     assert beside(adjustment, truth, THIRD)[0] < WRONG
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 def test_ground_that_moved_by_a_few_times_the_scatter_makes_no_scene_wrong():
     """A third of the image moved by 6 to 10 times what points scatter: motion followed it in 2 of 40."""

@@ -18,8 +18,6 @@ from amers.services.sensors.correction import no_correction
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.types import Array
 
-pytestmark = pytest.mark.thorough
-
 SHAPE = (4000, 3000)
 PIXELS = MapGrid("EPSG:32631", np.array([450e3, 4900e3]), np.array([[0.0, 1.0], [-1.0, 0.0]]), SHAPE)
 COUNT, SIGMA_PX, CHIP_PX = 100, 0.5, 64.0

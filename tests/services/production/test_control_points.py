@@ -15,7 +15,7 @@ from amers.services.types import Array, ControlPoints, Frame
 from tests.services.production.simulated_control import frame_error_m, free, placed, views
 from tests.services.simulated import OPTIONS, MemoryChips
 
-pytestmark = [pytest.mark.long, pytest.mark.thorough]
+pytestmark = pytest.mark.long
 
 NEW = 12
 """Seed of the images that are made into a block."""
@@ -58,6 +58,7 @@ def by_older() -> Production:
     return placed(NEW, Control((older(),)))
 
 
+@pytest.mark.thorough
 def test_control_places_the_block_as_precisely_as_it_declares() -> None:
     alone, made = free(NEW), by_older()
     error_m, frame_m2 = frame_error_m(made, views(NEW)), made.points.frames[0].covariance_m2

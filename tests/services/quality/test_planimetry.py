@@ -24,8 +24,6 @@ from amers.services.types import Acquisition, Array, ControlPoints, Frame
 from tests.services.simulated import MemoryChips
 from tests.services.textures import as_pixels, moved, texture
 
-pytestmark = pytest.mark.thorough
-
 GSD_M = 2.0
 SIDE = 2400
 CORNER_XY = (400_000.0, 5_800_000.0)
