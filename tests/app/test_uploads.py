@@ -374,10 +374,12 @@ def test_an_upload_that_is_ended_or_expires_leaves_nothing(
     assert me.head(first.headers["location"]).status_code == 404
     database = client.app.state.database  # type: ignore[attr-defined]
     remove_abandoned_uploads(database, storage)
-    assert me.head(second.headers["location"]).status_code == 200
-    with database.transaction() as connection:
-        let_pass(connection, hours=LIFE_HOURS + 1)
-    assert me.head(second.headers["location"]).status_code == 404
+    (arriving,) = storage.scratch().iterdir()
+    assert arriving.stat().st_mode & 0o777 == 0o600
+    for hours, status in ((LIFE_HOURS - 1, 200), (2, 404)):
+        with database.transaction() as connection:
+            let_pass(connection, hours=hours)
+        assert me.head(second.headers["location"]).status_code == status
     remove_abandoned_uploads(database, storage)
     assert list(storage.scratch().iterdir()) == []
 
