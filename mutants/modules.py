@@ -92,9 +92,9 @@ MODULES = (
     _of_service(
         "auth",
         "auth.py api/access.py api/credentials.py api/deps.py",
-        "basic_authentication sign_in tokens oidc access_matrix engine crowd",
+        "replies basic_authentication sign_in tokens oidc access_matrix engine crowd",
     ),
-    _of_service("tokens", "usecases/tokens.py db/tokens.py", "tokens oidc jobs sign_in"),
+    _of_service("tokens", "usecases/tokens.py db/tokens.py", "tokens replies oidc jobs sign_in"),
     _of_service("quotas", "usecases/quotas.py db/usage.py", "storage_quota jobs"),
     _of_service(
         "jobs",
@@ -104,12 +104,12 @@ MODULES = (
     _of_service(
         "superseding",
         "db/superseding.py db/density.py",
-        "superseding renewal_density feature_formats reply_models documents unpublished blocks",
+        "replies superseding renewal_density feature_formats reply_models documents unpublished blocks",
     ),
     _of_service(
         "points",
         "db/points.py db/point_detail.py db/history.py usecases/history.py usecases/features/points.py",
-        "unpublished points history chips blocks reply_models documents",
+        "replies unpublished points history chips blocks reply_models documents",
     ),
     _of_service("uploads", "usecases/uploads.py db/uploads.py", "uploads upload_faults"),
     _of_service("storage", "storage", "storage storage_identity bucket"),
