@@ -59,7 +59,9 @@ def test_a_scope_includes_the_lesser_ones(connection, scope):
 
 def test_a_revoked_token_is_refused_like_one_that_never_was(connection):
     new = create_token(connection, "survey office", ["read"])
+    other = create_token(connection, "mapping office", ["read"]).token
     revoke_token(connection, "survey office")
+    assert [tokens.is_valid(connection, one.id) for one in (new.token, other)] == [False, True]
     with pytest.raises(NotAllowed) as revoked:
         authenticate(connection, new.secret)
     with pytest.raises(NotAllowed) as unknown:
