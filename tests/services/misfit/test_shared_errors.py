@@ -71,3 +71,13 @@ def test_normal_errors_within_the_stated_sigmas_have_the_factor_one() -> None:
     rng = np.random.default_rng(25)
     scenes = [told(rng, 200, 0.0, 0.1, times=0.5) for _ in range(3)]
     assert all(one.factor == pytest.approx(1.0, abs=1e-3) for one in scenes)
+
+
+def test_residuals_are_clipped_at_a_number_of_their_own_sigmas() -> None:
+    rng = np.random.default_rng(3)
+    sigma = rng.uniform(0.2, 3.0, (20, 2))
+    misfit = 100.0 * rng.choice([-1.0, 1.0], (20, 2))
+    t, parameters = rng.uniform(-1.0, 1.0, (20, 2)), rng.normal(size=(2, 3))
+    fit = AffineFit(t, misfit, sigma**2, np.zeros((20, 0)), np.zeros((2, 0)))
+    residual = fit.clipped(parameters, 2.5).misfit - fit.design @ parameters.T
+    np.testing.assert_allclose(residual, 2.5 * sigma * np.sign(misfit))
