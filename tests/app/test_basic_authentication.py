@@ -9,6 +9,7 @@ from uuid import uuid4
 import pytest
 from fastapi.testclient import TestClient
 
+from amers.app.api.credentials import Credentials
 from amers.app.api.routes import _key
 from amers.app.config import Settings
 from amers.app.db.cluster.embedded import Cluster
@@ -151,6 +152,12 @@ def test_all_that_follows_the_first_colon_is_the_password(
 
 def as_bytes(value: str | bytes) -> bytes:
     return value.encode() if isinstance(value, str) else value
+
+
+def test_credentials_are_shown_without_their_secret() -> None:
+    shown = repr(Credentials("bearer", "a-secret"))
+    assert "bearer" in shown
+    assert "a-secret" not in shown
 
 
 def test_two_credentials_in_one_request_are_refused(client: TestClient, token: Callable[[str], str]):

@@ -6,6 +6,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from uuid import UUID, uuid4
 
@@ -290,6 +291,19 @@ def test_the_next_job_of_an_owner_is_called_when_one_has_lost_too_many_workers(c
     assert attempts.take_back(connection, ATTEMPTS_ALLOWED) == [lost]
     assert tickets(connection) == 1
     assert claim(connection, 1).id == waiting
+
+
+def test_of_several_lost_jobs_each_waits_again_or_fails_by_its_own_attempts(connection: Connection):
+    owner = owner_named(connection, "one")
+    lost = [ask(connection, owner) for _ in range(4)]
+    for number, job in enumerate(lost):
+        claim(connection)
+        attempt = ATTEMPTS_ALLOWED if number % 2 else 1
+        run_sql(connection, "update job set attempt = %s where id = %s", [attempt, job])
+    run_sql(connection, "update job set lease_until = now() - interval '1 s'")
+    assert sorted(attempts.take_back(connection, ATTEMPTS_ALLOWED)) == sorted(lost)
+    states = [job.state for job in map(partial(jobs.find, connection), lost) if job is not None]
+    assert states == ["accepted", "failed", "accepted", "failed"]
 
 
 def test_jobs_at_the_limit_need_no_lost_tickets_and_others_get_them(database: Database):

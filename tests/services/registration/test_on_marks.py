@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from amers.services.geodesy import move_metres
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage
 from amers.services.registration.on_marks import register_on_marks
@@ -60,6 +61,15 @@ def test_the_model_follows_the_marks():
     assert registration.model.project(ground) == pytest.approx(corner + OFF_PX, abs=0.02)
     assert registration.qualification.verdict == "usable"
     assert registration.frame == FRAME
+
+
+def test_residuals_on_the_ground_are_those_in_the_image():
+    """Of a mark that is 3 px off in line, and of the others: ground moved by them is seen as far off."""
+    measures = register_on_marks(SCENE, moved(marks_at(eight()), 0, np.array([3.0, 0.0]))).measures
+    step = np.column_stack([measures.residual_m, np.zeros(8)])
+    seen = MODEL.project(move_metres(measures.lon_lat_h, step)) - MODEL.project(measures.lon_lat_h)
+    assert np.abs(measures.residual_px).max() > 1.0
+    np.testing.assert_allclose(seen, measures.residual_px, atol=0.01)
 
 
 def test_the_mark_that_it_asks_for_brings_what_it_states():
