@@ -177,8 +177,8 @@ def test_points_far_apart_have_the_same_surface_as_those_of_a_whole() -> None:
     off_m = alone.height_m - made.points.surface.height_m[rows]
     assert (np.abs(off_m) < np.maximum(1.0, 2.0 * alone.sigma_m)).all()
     of_models_m2, common = np.array([1.0, 4.0, 9.0]), {"work": Work(), "progress": no_progress}
-    less_sure, _ = surfaces_at(scenes, places[rows], 10, of_models_m2=of_models_m2, **common)
-    np.testing.assert_allclose(less_sure.sigma_m**2, alone.sigma_m**2 + of_models_m2)
+    with_models, _ = surfaces_at(scenes, places[rows], 10, of_models_m2=of_models_m2, **common)
+    np.testing.assert_allclose(with_models.sigma_m**2, alone.sigma_m**2 + of_models_m2)
 
 
 def read_triplet(folder: Path, names: Sequence[str]) -> list[Scene]:
