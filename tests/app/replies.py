@@ -1,7 +1,7 @@
 """What the service answers to every request that reads, in an installation with something of each kind.
 
-Two blocks overlap, so that points are superseded; a third lies across the meridian of 180 degrees, and a
-fourth is not published. One point is suspended, three have been tried, and two scenes are described.
+Two blocks overlap; a third lies across the meridian of 180 degrees, a fourth ends at it, and a fifth is
+not published. One point is suspended, three have been tried, and two scenes are described.
 What is of one run alone is left out of the replies: ids, times of the run, tokens of pages.
 """
 
