@@ -83,7 +83,8 @@ release: postgis page
 mutants: postgis
 	$(BIN)/python -m mutants $(MODULE) $(if $(SAMPLE),--sample $(SAMPLE)) $(if $(SINCE),--since $(SINCE))
 
-# A handful, of lines changed since the branch left origin/main, or since SINCE: a report within a minute.
+# A handful, of lines changed since the branch left origin/main, in the last change of the code, or since SINCE:
+# a report within a minute.
 mutants-changed: postgis
 	$(BIN)/python -m mutants.changed --within 60 $(if $(SINCE),--since $(SINCE))
 

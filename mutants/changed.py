@@ -16,7 +16,15 @@ from pathlib import Path
 
 from mutants.changes import Mutant, mutants_of
 from mutants.covering import coverage_within
-from mutants.drawing import ROOT, changed_lines, commit, drawn, is_among, shared_commit
+from mutants.drawing import (
+    ROOT,
+    changed_lines,
+    commit,
+    drawn,
+    is_among,
+    last_change_of,
+    shared_commit,
+)
 from mutants.modules import MODULES, all_tests, importing
 from mutants.report import Trial, survivors
 from mutants.trials import copied_project, tried
@@ -38,7 +46,9 @@ def main() -> None:
     """Report on mutants of changed lines."""
     parser = argparse.ArgumentParser(prog="python -m mutants.changed", description=__doc__)
     parser.add_argument(
-        "--since", default=base(), help="a commit (default: where the branch left origin/main)"
+        "--since",
+        default=base(),
+        help="a commit (default: where the branch left origin/main, or before the code changed last)",
     )
     parser.add_argument("--sample", type=int, default=6, help="mutants of all that changed (default: 6)")
     parser.add_argument("--within", type=float, default=80.0, help="seconds for all (default: 80)")
@@ -54,9 +64,12 @@ def main() -> None:
 
 
 def base() -> str:
-    """The commit at which HEAD left origin/main; its first parent, where it is there; empty for none."""
-    head, shared = commit(), shared_commit("origin/main")
-    return shared if shared not in ("", head) else commit("HEAD^")
+    """The commit at which HEAD left origin/main, or the one before the last change of the code.
+
+    Empty where neither is here.
+    """
+    shared = shared_commit("origin/main")
+    return shared if shared not in ("", commit()) else commit(f"{last_change_of(CODE)}^")
 
 
 def _mutants_of(lines: dict[str, set[int]]) -> Iterator[Mutant]:

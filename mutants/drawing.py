@@ -31,6 +31,11 @@ def shared_commit(branch: str) -> str:
     return commit(_git("merge-base", branch, "HEAD", check=False).strip() or "-")
 
 
+def last_change_of(paths: Iterable[str]) -> str:
+    """The last commit that changed one of some files or folders; empty where none did."""
+    return _git("log", "-1", "--format=%H", "--", *paths, check=False).strip()
+
+
 def changed_lines(since: str) -> dict[str, set[int]]:
     """Lines of the working tree that a commit did not have, by file."""
     lines, path = dict[str, set[int]](), ""

@@ -38,21 +38,35 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Count lines for a test, and end it when the time has passed."""
+    """Count lines for a test."""
     _traced.switch_context(item.nodeid)
+    try:
+        return (yield)
+    finally:
+        _traced.switch_context(IMPORT)
+
+
+@pytest.hookimpl(wrapper=True, trylast=True)
+def pytest_runtest_setup(item: pytest.Item) -> Iterator[None]:
+    """Skip a test, before its fixtures, when the time has passed."""
+    if _left_s(item) <= 0.0:
+        pytest.skip(PASSED)
+    return (yield from _ended_in_time(item))
+
+
+@pytest.hookimpl(wrapper=True, trylast=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    """End a test when the time has passed."""
+    return (yield from _ended_in_time(item))
+
+
+def _ended_in_time(item: pytest.Item) -> Iterator[None]:
+    """The alarm goes off in fixtures and tests only: between them it would end pytest itself."""
     signal.setitimer(signal.ITIMER_REAL, min(max(_left_s(item), 0.0) + GRACE_S, LONGEST_S))
     try:
         return (yield)
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
-        _traced.switch_context(IMPORT)
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Skip a test, before its fixtures, when the time has passed."""
-    if _left_s(item) <= 0.0:
-        pytest.skip(PASSED)
 
 
 def _left_s(item: pytest.Item) -> float:
