@@ -8,6 +8,7 @@ import time
 from contextlib import suppress
 from itertools import cycle, islice
 from pathlib import Path
+from typing import Self
 
 import httpx
 
@@ -37,6 +38,8 @@ def installed_at(folder: Path, **settings: str) -> dict[str, str]:
 class Service:
     """A running `amers serve` with options, and a data folder of its own.
 
+    In a `with` statement it serves, with its worker unless an option leaves it out, and is then ended.
+
     Attributes:
         folder: its data folder.
         log: what it says.
@@ -46,6 +49,7 @@ class Service:
     def __init__(self, folder: Path, *options: str, **settings: str) -> None:
         self.folder = folder
         self.port = free_port()
+        self.has_worker = "--no-worker" not in options
         self.cluster = Cluster(folder / "postgres")
         self.environment = installed_at(folder, **settings)
         self.log = folder.with_suffix(".log")
@@ -56,6 +60,15 @@ class Service:
                 stdout=output,
                 stderr=output,
             )
+
+    def __enter__(self) -> Self:
+        if not until(lambda: self.is_ready() and (self.workers() or not self.has_worker)):
+            self.end()
+            raise AssertionError(self.log.read_text())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
 
     def end(self) -> None:
         """Stop the service by SIGTERM and wait until it has ended."""

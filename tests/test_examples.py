@@ -12,7 +12,7 @@ import pytest
 
 from amers.services.formats.block.reader import read_block
 from amers.services.formats.sensor_models.rpc_files import read_rpc
-from tests.service_process import Service, until
+from tests.service_process import Service
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
@@ -72,15 +72,12 @@ def test_what_is_drawn_on_a_scene_is_where_the_truth_is(registered):
 
 
 def test_points_are_queried_from_a_service_and_drawn(made, open_folder, tmp_path):
-    service = Service(open_folder / uuid4().hex[:8], "--no-worker", AMERS_PUBLIC_POINTS="true")
-    try:
-        assert until(service.is_ready), service.log.read_text()
+    settings = {"AMERS_PUBLIC_POINTS": "true"}
+    with Service(open_folder / uuid4().hex[:8], "--no-worker", **settings) as service:
         run("-m", "amers", "block", "ingest", made / "block", "--publish", **service.environment)
         points = read_block(made / "block").points
         (west, south), (east, north) = (f(points.lon_lat_h[:, :2], axis=0) for f in (np.min, np.max))
         box = f"{west},{south},{east},{north}"
         printed = run(EXAMPLES / "query_points.py", box, tmp_path / "map.png", service.url)
-    finally:
-        service.end()
     assert "control points" in printed
     assert (tmp_path / "map.png").stat().st_size > 10_000

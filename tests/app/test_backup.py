@@ -19,7 +19,7 @@ from amers.app.usecases.tokens import create_token
 from tests.app.flat_world import SIGMA_M, make_flat_world
 from tests.app.worker_processes import wait_until
 from tests.factories import make_block
-from tests.service_process import Service, until
+from tests.service_process import Service
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
@@ -81,12 +81,6 @@ def amers(service: Service, *words: str | Path) -> dict[str, object]:
     return answer
 
 
-def started(folder: Path) -> Service:
-    service = Service(folder)
-    assert until(service.is_ready), service.log.read_text()
-    return service
-
-
 def answers(service: Service, secret: str, paths: tuple[str, ...]) -> dict[str, tuple[int, bytes]]:
     """The replies to an administrator for each path, without the address of the service."""
     headers = SAME_HOST | {"Authorization": f"Bearer {secret}"}
@@ -105,8 +99,7 @@ def place(open_folder: Path):
 
 def test_a_destroyed_installation_is_restored_and_gives_the_same_answers(place: Path, tmp_path: Path):
     world = make_flat_world(tmp_path / "world", size=800)
-    service = started(place / "data")
-    try:
+    with Service(place / "data") as service:
         with service.cluster.lease() as dsn, engine.connect(dsn) as connection:
             storage = Storage(service.folder / "storage")
             for block in (world.block, make_block(tmp_path / "block").folder):
@@ -140,13 +133,10 @@ def test_a_destroyed_installation_is_restored_and_gives_the_same_answers(place: 
         assert amers(service, "db", "backup", backup)["damaged"] == []
         before = answers(service, secret, paths)
         assert {path: status for path, (status, _) in before.items() if status != 200} == {}
-    finally:
-        service.end()
 
     shutil.rmtree(place / "data")
     amers(service, "db", "restore", backup)
-    restored = started(place / "data")
-    try:
+    with Service(place / "data") as restored:
         after = answers(restored, secret, paths)
         for path, said in before.items():
             if path in tiles:
@@ -157,5 +147,3 @@ def test_a_destroyed_installation_is_restored_and_gives_the_same_answers(place: 
             again = client.post("/processes/register-scene/execution", json=body).json()["jobID"]
             wait_until(lambda: client.get(f"/jobs/{again}").json()["status"] in ENDED, "the job ends")
             assert client.get(f"/jobs/{again}").json()["status"] == "successful", "it works on"
-    finally:
-        restored.end()

@@ -32,15 +32,10 @@ SMALL_WINDOW = 4096
 
 @contextmanager
 def running(open_folder: Path) -> Iterator[Service]:
-    service = Service(open_folder / uuid4().hex[:8])
-    try:
-        assert until(service.is_ready), service.log.read_text()
-        assert until(service.workers), service.log.read_text()
+    with Service(open_folder / uuid4().hex[:8]) as service:
         yield service
-    finally:
-        service.end()
-        with service.cluster.lease():
-            pass
+    with service.cluster.lease():
+        pass
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from amers.app.db.cluster.embedded import Cluster
 from tests.app.flat_world import CENTRE, GROUND_H, FlatWorld, make_flat_world
 from tests.command_line import amers_here
 from tests.journeys.map_page import ARTEFACTS, BUILT, DESKTOP, is_error, patience_ms
-from tests.service_process import Service, installed_at, until
+from tests.service_process import Service, installed_at
 
 Amers = Callable[..., Any]
 Visit = Callable[..., Page]
@@ -46,13 +46,8 @@ def installation(open_folder: Path) -> Iterator[Path]:
 def service(installation: Path) -> Iterator[Service]:
     """A running service on the installation."""
     references = str(installation / "references")
-    service = Service(installation / "data", AMERS_REFERENCE_FOLDER=references)
-    try:
-        assert until(service.is_ready), service.log.read_text()
-        assert until(service.workers), service.log.read_text()
+    with Service(installation / "data", AMERS_REFERENCE_FOLDER=references) as service:
         yield service
-    finally:
-        service.end()
 
 
 @pytest.fixture(scope="module")

@@ -86,13 +86,9 @@ def public(tls_port: int) -> str:
 
 @pytest.fixture(scope="module")
 def service(installation: Path, public: str) -> Iterator[Service]:
-    service = Service(installation / "data", AMERS_PUBLIC_URL=public, AMERS_TRUSTED_PROXIES=HOST)
-    try:
-        assert until(service.is_ready), service.log.read_text()
-        assert until(service.workers), service.log.read_text()
+    settings = {"AMERS_PUBLIC_URL": public, "AMERS_TRUSTED_PROXIES": HOST}
+    with Service(installation / "data", **settings) as service:
         yield service
-    finally:
-        service.end()
 
 
 @pytest.fixture(scope="module")

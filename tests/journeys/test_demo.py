@@ -175,10 +175,8 @@ def run(words: list[str], service: Service, folder: Path) -> str:
 def first_run(demo, open_folder) -> Iterator[tuple[Service, Path, dict[str, str]]]:
     """A running service, the folder of `demo-output`, and what the commands of the README print."""
     folder = Path(demo["report"]).parents[2]
-    service = Service(open_folder / uuid4().hex[:8], AMERS_PUBLIC_POINTS="true")
     printed = {}
-    try:
-        assert until(service.is_ready), service.log.read_text()
+    with Service(open_folder / uuid4().hex[:8], AMERS_PUBLIC_POINTS="true") as service:
         activation, *lines, serving = lines_of_readme("## First run", "bash").splitlines()
         assert activation == ". .venv/bin/activate"
         assert serving.split("#")[0].strip() == "amers serve"
@@ -187,8 +185,6 @@ def first_run(demo, open_folder) -> Iterator[tuple[Service, Path, dict[str, str]
             assert command[0] == "amers"
             printed[command[2]] = run([sys.executable, "-m", "amers", *command[1:]], service, folder)
         yield service, folder, printed
-    finally:
-        service.end()
 
 
 def test_the_first_run_of_the_readme_registers_the_scene_of_the_demo(first_run):

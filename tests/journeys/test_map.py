@@ -226,18 +226,13 @@ def test_a_new_block_is_drawn_as_soon_as_it_is_ingested(visit, administrator, tm
 @pytest.fixture(scope="module")
 def with_background(service: Service, world: FlatWorld) -> Iterator[Service]:
     """A second service on the same store, whose operator has chosen a background."""
-    second = Service(
-        service.folder,
-        "--no-worker",
-        AMERS_MAP_BACKGROUND=TILES,
-        AMERS_MAP_BACKGROUND_ATTRIBUTION=ATTRIBUTION,
-        AMERS_PUBLIC_POINTS="true",
-    )
-    try:
-        assert until(second.is_ready), second.log.read_text()
+    settings = {
+        "AMERS_MAP_BACKGROUND": TILES,
+        "AMERS_MAP_BACKGROUND_ATTRIBUTION": ATTRIBUTION,
+        "AMERS_PUBLIC_POINTS": "true",
+    }
+    with Service(service.folder, "--no-worker", **settings) as second:
         yield second
-    finally:
-        second.end()
 
 
 def test_the_background_of_the_operator_is_drawn_with_who_made_it(
