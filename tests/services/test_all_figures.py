@@ -20,6 +20,7 @@ from amers.services.quality.accuracy import accuracy, normalised_error, statisti
 from amers.services.registration.options import RegistrationOptions
 from amers.services.types import Frame
 from amers.services.vectors.accuracy import ErrorSources
+from tests.services import judged_worlds as judged
 from tests.services.adjustment import test_block_control as controlled
 from tests.services.figures import Figures, differing, figures
 from tests.services.joint import test_joint_block as joint
@@ -127,6 +128,7 @@ WORLDS: dict[str, Callable[[], Any]] = {
     "mosaic": _mosaic,
     "vectors": _vectors,
     "accuracy": _accuracy,
+    **judged.WORLDS,
 }
 """What is computed, by its name."""
 

@@ -24,7 +24,7 @@ from amers.services.reports.report import (
 )
 from amers.services.sensors.correction import CorrectedModel
 from amers.services.types import Acquisition, FloatImage, Frame, Measures, ViewMeasures
-from tests.services.conftest import FlatModel
+from tests.services.conftest import FlatModel, register
 
 FRAME = Frame.from_sigmas(1.5, 2.5)
 
@@ -90,67 +90,66 @@ def chip_comparison(k: int) -> ChipComparison:
     )
 
 
-@pytest.fixture
-def material(registered) -> Callable[..., Material]:
-    """Makes what a report is built from; takes what `register` takes, and `name`."""
-
-    def make(
-        name: str = "IMG_PHR1A_201201", compared: int = 16, frame: Frame = FRAME, **of_registration
-    ) -> Material:
-        scene = replace(registered(**of_registration), frame=frame)
-        lines, samples = scene.shape
-        corner = np.array([samples, -lines]) * scene.gsd_m / 111_320.0
-        rng = np.random.default_rng(1)
-        none = np.empty(0, dtype=np.int64)
-        registration = Registration(
-            model=CorrectedModel(FlatModel(), scene.adjustment.correction),
-            adjustment=scene.adjustment,
+def material_of(
+    name: str = "IMG_PHR1A_201201", compared: int = 16, frame: Frame = FRAME, **of_registration
+) -> Material:
+    """What a report is built from; takes what `register` takes, and a name."""
+    scene = replace(register(**of_registration), frame=frame)
+    lines, samples = scene.shape
+    corner = np.array([samples, -lines]) * scene.gsd_m / 111_320.0
+    rng = np.random.default_rng(1)
+    none = np.empty(0, dtype=np.int64)
+    registration = Registration(
+        model=CorrectedModel(FlatModel(), scene.adjustment.correction),
+        adjustment=scene.adjustment,
+        measures=scene.measures,
+        views=ViewMeasures(none, none, np.empty(0), none.astype(bool), none.astype(str)),
+        search_stages=(
+            SearchStage("coarse", 2.0, 60.0, 56.0, 50, 44, 2, 41, 31.0),
+            SearchStage("fine", 0.5, 6.0, 5.0, len(scene.measures.score), 52, 0, 48, 0.4),
+        ),
+        frame=scene.frame,
+        qualification=qualify(scene.adjusted(), QualificationOptions(), rng),
+    )
+    return Material(
+        registration=registration,
+        scene=SceneRecord(
+            name=name,
+            acquisition=Acquisition(
+                "IMG_1", "PHR1A", datetime(2012, 1, 5, 10, 42, tzinfo=UTC), 12.3, 190.0, 24.5, 165.0
+            ),
+            lines=lines,
+            samples=samples,
+            gsd_m=scene.gsd_m,
+            model="RPC",
+            sigma_m=10.0,
+            footprint_lon_lat=np.array([[0.0, 0.0], [0.0, corner[1]], corner, [corner[0], 0.0]]),
+        ),
+        run=RunRecord(
+            software_version="0.1.0",
+            started_at=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC),
+            finished_at=datetime(2026, 1, 2, 3, 5, 5, tzinfo=UTC),
+            method="control points",
+            blocks=(BlockUsed("calanques", "1"),),
+            options=RegistrationOptions(),
+        ),
+        refined_model=RefinedModelRecord(0.0004, "refined_RPC.TXT carries the correction"),
+        figure_data=FigureData(
             measures=scene.measures,
-            views=ViewMeasures(none, none, np.empty(0), none.astype(bool), none.astype(str)),
-            search_stages=(
-                SearchStage("coarse", 2.0, 60.0, 56.0, 50, 44, 2, 41, 31.0),
-                SearchStage("fine", 0.5, 6.0, 5.0, len(scene.measures.score), 52, 0, 48, 0.4),
-            ),
-            frame=scene.frame,
-            qualification=qualify(scene.adjusted(), QualificationOptions(), rng),
-        )
-        return Material(
-            registration=registration,
-            scene=SceneRecord(
-                name=name,
-                acquisition=Acquisition(
-                    "IMG_1", "PHR1A", datetime(2012, 1, 5, 10, 42, tzinfo=UTC), 12.3, 190.0, 24.5, 165.0
-                ),
-                lines=lines,
-                samples=samples,
-                gsd_m=scene.gsd_m,
-                model="RPC",
-                sigma_m=10.0,
-                footprint_lon_lat=np.array([[0.0, 0.0], [0.0, corner[1]], corner, [corner[0], 0.0]]),
-            ),
-            run=RunRecord(
-                software_version="0.1.0",
-                started_at=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC),
-                finished_at=datetime(2026, 1, 2, 3, 5, 5, tzinfo=UTC),
-                method="control points",
-                blocks=(BlockUsed("calanques", "1"),),
-                options=RegistrationOptions(),
-            ),
-            refined_model=RefinedModelRecord(0.0004, "refined_RPC.TXT carries the correction"),
-            figure_data=FigureData(
-                measures=scene.measures,
-                quicklook=Quicklook(landscape((400, 500), seed=9), 10.0),
-                gallery=tuple(chip_comparison(k) for k in range(compared)),
-            ),
-            checks=(
-                Check("simulated truth", accuracy(np.random.default_rng(4).normal(0, 0.1, (25, 2)))),
-            ),
-        )
-
-    return make
+            quicklook=Quicklook(landscape((400, 500), seed=9), 10.0),
+            gallery=tuple(chip_comparison(k) for k in range(compared)),
+        ),
+        checks=(Check("simulated truth", accuracy(np.random.default_rng(4).normal(0, 0.1, (25, 2)))),),
+    )
 
 
 @pytest.fixture
-def report(material) -> RegistrationReport:
+def material() -> Callable[..., Material]:
+    """Makes what a report is built from."""
+    return material_of
+
+
+@pytest.fixture
+def report() -> RegistrationReport:
     """The report of a clean registration."""
-    return material().report()
+    return material_of().report()

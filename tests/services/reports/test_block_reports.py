@@ -42,8 +42,8 @@ RELATIVE, EARTH = Accuracy90(1.1, 1.2, 1.3, 1.4), Accuracy90(5.1, 5.2, 5.3, 5.4)
 NEAR, FAR = PlannedSite("near", (5.5, 43.25)), PlannedSite("far", (6.5, 43.75))
 
 
-@pytest.fixture(scope="module")
-def plan() -> PlanReport:
+def plan_report() -> PlanReport:
+    """A plan with one image and two sites that are proposed, the one after the other."""
     image = PlannedImage("one", (5.0, 43.0), (1000.0, 1000.0), 2.0, 15.0, 100.0, 6.0)
     proposed = (
         ProposedSite(FAR, Accuracy90(4.0, 4.1, 4.2, 4.3), np.array([0.5, 1.1])),
@@ -61,6 +61,11 @@ def plan() -> PlanReport:
     )
     block = BlockPlan((image,), 500.0, candidates=(NEAR, FAR))
     return PlanReport("a plan", block, forecast, 1.5, WHEN, "0.1.0")
+
+
+@pytest.fixture
+def plan() -> PlanReport:
+    return plan_report()
 
 
 def test_a_plan_states_its_accuracy_relative_first_and_what_each_further_site_gains(
