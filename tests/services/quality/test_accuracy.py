@@ -11,13 +11,6 @@ from amers.services.quality.normal_law import CIRCULAR_CE90, normal_ce90
 a_ten_thousandth = 1e-4
 
 
-def test_the_interval_of_a_quantile_is_made_of_the_tabulated_order_statistics():
-    """n = 100, 90 %: binomial tables give orders 85 and 96 at 5 % a side."""
-    quantile = sample_quantile(np.arange(1.0, 101.0))
-    assert (quantile.lower, quantile.upper) == (85.0, 96.0)
-    assert quantile.note == ""
-
-
 @pytest.mark.parametrize(("n", "bounded"), [(28, False), (29, True)])
 def test_the_90_percent_quantile_is_bounded_above_from_29_values_on(n, bounded):
     quantile = sample_quantile(np.arange(float(n)))
@@ -71,13 +64,6 @@ def test_a_quantile_lies_within_its_interval_and_its_sample(values):
     assert min(values) - rounding <= quantile.value <= max(values) + rounding
     assert np.isnan(quantile.lower) or quantile.lower <= quantile.value + rounding
     assert np.isnan(quantile.upper) or quantile.value <= quantile.upper + rounding
-
-
-def test_statistics_are_those_of_the_finite_values():
-    result = statistics(np.array([1.0, np.nan, 3.0]))
-    assert (result.n, result.mean) == (2, 2.0)
-    assert result.std == pytest.approx(np.sqrt(2.0))
-    assert result.rms == pytest.approx(np.sqrt(5.0))
 
 
 def test_accuracy_separates_bias_from_spread_on_each_axis():
@@ -143,17 +129,6 @@ def test_normalised_errors_leave_out_missing_values():
     result = normalised_error(error, covariance)
     assert (result.n, result.mean_square) == (1, 1.0)
     assert np.isnan(normalised_error(error[1:2], covariance[1:2]).mean_square)
-
-
-@pytest.mark.parametrize(
-    ("ratio", "factor"),
-    [(0.0, 1.64485), (0.25, 1.66461), (0.5, 1.73708), (0.75, 1.90335), (1.0, 2.14597)],
-)
-def test_predicted_ce90_agrees_with_a_quadrature_of_its_own(ratio, factor):
-    """Factors by adaptive quadrature of the bivariate normal law (scipy.integrate.quad), to 1e-5."""
-    turn = np.array([[0.8, -0.6], [0.6, 0.8]])
-    covariance = turn @ np.diag([4.0, 4.0 * ratio**2]) @ turn.T
-    assert normal_ce90(covariance[None])[0] == pytest.approx(2.0 * factor, rel=a_ten_thousandth)
 
 
 def test_predicted_ce90_of_an_unknown_covariance_is_unknown():

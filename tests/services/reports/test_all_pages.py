@@ -28,6 +28,7 @@ from amers.services.quality.accuracy_statement import median_accuracy
 from amers.services.registration.options import RegistrationOptions
 from amers.services.reports.base import BaseReport
 from amers.services.reports.base_pages import BASE_PAGE
+from amers.services.reports.block_adjustment import points_csv as points_of_block
 from amers.services.reports.block_adjustment_pages import ADJUSTMENT_PAGE, IMAGES_PAGE
 from amers.services.reports.block_quality_pages import QUALITY_PAGE
 from amers.services.reports.document import report_document
@@ -35,12 +36,14 @@ from amers.services.reports.failure_pages import FAILURE_PAGE
 from amers.services.reports.html import Page, format_html
 from amers.services.reports.joint import JointReport, joint_report
 from amers.services.reports.joint_pages import JOINT_PAGE
+from amers.services.reports.plan import points_csv as points_of_plan
 from amers.services.reports.plan_pages import PLAN_PAGE
 from amers.services.reports.registration_pages import REGISTRATION_PAGE
-from amers.services.reports.selection import SelectionReport, SourceFacts, selection_report
+from amers.services.reports.selection import SelectionReport, SourceFacts, overlap_csv, selection_report
 from amers.services.reports.selection_pages import SELECTION_PAGE
 from amers.services.reports.surface import DifferenceReport, ReducedMap, SurfaceReport
 from amers.services.reports.surface_pages import DIFFERENCE_PAGE, SURFACE_PAGE
+from amers.services.reports.text import format_text
 from amers.services.surface.match import REASON_LABELS
 from amers.services.types import Frame
 from benchmarks._catalogue import simulate_catalogue
@@ -184,19 +187,34 @@ PAGES: dict[str, tuple[Page, Callable[[], Any]]] = {
     "difference of surfaces": (DIFFERENCE_PAGE, _difference),
 }
 """The template of a page, and what makes its report, by its name."""
+TABLES: dict[str, Callable[[Any], str]] = {
+    "plan": points_of_plan,
+    "adjustment": points_of_block,
+    "selection": overlap_csv,
+}
+"""What makes a table beside a page."""
 
 
 def found(name: str) -> Figures:
-    """What a page tells, and the document beside it where it is no copy of the report."""
+    """What a page tells, as a text too, and what its document and the table beside it do."""
     page, make = PAGES[name]
     report = make()
+    more = told(re.sub("(?<=\n)", "</p>", format_text(page, report))) if page.has_text else {}
+    if name in TABLES:
+        more |= told(TABLES[name](report).replace("\n", "</p>"))
     document = figures({"document": report_document(report)}) if hasattr(report, "document") else {}
-    return told(format_html(page, report)) | document
+    return (
+        {f"text: {words}": values for words, values in more.items()}
+        | told(format_html(page, report))
+        | document
+    )
 
 
 @pytest.mark.parametrize("name", PAGES)
 def test_every_page_is_what_it_was(name: str) -> None:
-    assert not differing(found(name), json.loads(GOLDEN.read_text())[name])
+    now, expected = found(name), json.loads(GOLDEN.read_text())[name]
+    assert not differing(now, expected)
+    assert list(now) == list(expected), "what comes first"
 
 
 def _written(name: str) -> str:

@@ -1,8 +1,5 @@
 """What the reports on plans, adjustments and selections say of a block, from figures that are put in."""
 
-import csv
-import io
-from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -22,7 +19,6 @@ from amers.services.reports.block_adjustment import (
     AdjustmentReport,
     ControlFit,
 )
-from amers.services.reports.block_adjustment import points_csv as points_of_block
 from amers.services.reports.block_quality import (
     BlockIdentification,
     Measured,
@@ -30,8 +26,7 @@ from amers.services.reports.block_quality import (
     block_quality_report,
     degree_words,
 )
-from amers.services.reports.document import report_document
-from amers.services.reports.plan import PlanReport, points_csv
+from amers.services.reports.plan import PlanReport
 from amers.services.reports.selection import share_words
 from amers.services.types import Frame
 from tests.factories import control_points
@@ -78,25 +73,6 @@ def test_a_plan_states_its_accuracy_relative_first_and_what_each_further_site_ga
     assert "far (6.5000, 43.7500): mean CE90 on the Earth 5.10 m to 4.00 m, LE90 4.10 m" in first
     assert "near (5.5000, 43.2500): mean CE90 on the Earth 4.00 m to 3.50 m, LE90 3.60 m" in second
     assert "core-hours" in cost
-
-
-def test_the_document_of_a_plan_names_what_each_candidate_gains(plan: PlanReport) -> None:
-    document = report_document(plan)
-    assert [one["name"] for one in document["proposed"]] == ["far", "near"]
-    assert document["proposed"][0]["gain_m"] == {"near": 0.5, "far": 1.1}
-    assert document["proposed"][1]["gain_m"] == {"near": 0.5, "far": None}
-    assert document["on_the_earth"]["worst_le90_m"] == 5.4
-    assert document["relative_to_control_points"]["ce90_m"] == 1.1
-    assert (document["points"], document["verdict"]) == (2, "predicted")
-
-
-def test_every_place_of_a_plan_has_its_accuracy_on_the_earth(plan: PlanReport) -> None:
-    rows = list(csv.DictReader(io.StringIO(points_csv(plan))))
-    found = [{name: float(value) for name, value in row.items()} for row in rows]
-    assert found == [
-        {"lon": 5.0, "lat": 43.0, "ce90_m": 2.0, "le90_m": 7.0},
-        {"lon": 5.25, "lat": 43.5, "ce90_m": 3.0, "le90_m": 8.0},
-    ]
 
 
 def adjusted(odd: int = 0, contradicting: int = 0, control: int = 3) -> AdjustmentReport:
@@ -148,25 +124,6 @@ def test_a_block_is_looked_at_for_each_odd_image_and_each_contradiction(
     report = adjusted(odd, contradicting, control)
     assert (report.verdict, report.verdict_words) == (verdict, words)
     assert [one.name for one in report.left_out] == [f"P{k}" for k in range(contradicting)]
-
-
-def test_the_document_of_an_adjustment_has_residuals_before_and_after_and_no_unknown_height() -> None:
-    document = report_document(adjusted())
-    assert document["residuals_px"] == {"delivered": 9.0, "adjusted": 0.3, "points": 0.2}
-    assert document["control"][0]["misfit_m"] == [0.5, -0.5, None]
-    assert document["points_without_surface"] == {"no texture": 1}
-    words = "1 of 2 have no height of the surface (no texture: 1)"
-    assert adjusted().without_surface_words == words
-    assert replace(adjusted(), without_surface={}).without_surface_words == ""
-    assert document["on_the_earth"]["le90_m"] > document["relative_to_control_points"]["le90_m"]
-
-
-def test_the_points_of_a_block_have_their_sigmas_by_east_north_and_up() -> None:
-    rows = list(csv.DictReader(io.StringIO(points_of_block(adjusted()))))
-    assert [float(rows[1][f"sigma_{axis}_m"]) for axis in ("east", "north", "up")] == [4.0, 5.0, 6.0]
-    assert [float(rows[1][name]) for name in ("lon", "lat", "h_m")] == [6.0, 44.0, 200.0]
-    assert [int(rows[0][name]) for name in ("id", "images", "used")] == [0, 3, 2]
-    assert [float(rows[0][name]) for name in ("rms_px", "largest_px")] == [0.1, 0.3]
 
 
 @pytest.mark.parametrize(
