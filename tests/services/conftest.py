@@ -144,7 +144,11 @@ def register(
     return Registered(measures, adjustment, partial(refit, like=adjustment), truth)
 
 
+Make = Callable[..., Registered]
+"""Makes a registration."""
+
+
 @pytest.fixture
-def registered() -> Callable[..., Registered]:
+def registered() -> Make:
     """A function that makes a registration; see `register`."""
     return register

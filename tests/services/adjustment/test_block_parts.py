@@ -27,13 +27,16 @@ of_a_variance = 0.02
 rounding = 1e-7
 
 
+InParts = Callable[..., set[int]]
+
+
 @pytest.fixture(scope="module")
 def block() -> tuple[Array, list[ImageParameters], Observations, list[BoolArray]]:
     return large_block(N_IMAGES, PER_IMAGE, seed=3, blunders=0.05)
 
 
 @pytest.fixture
-def in_parts(monkeypatch: pytest.MonkeyPatch) -> Callable[..., set[int]]:
+def in_parts(monkeypatch: pytest.MonkeyPatch) -> InParts:
     """Makes parts of a block that is small, and groups of its parameters; tells the sizes of levels."""
     level, sizes = dissection._level, set()
 
@@ -99,9 +102,7 @@ def agree(parts: BlockAdjustment, whole: BlockAdjustment) -> None:
 
 
 @pytest.mark.parametrize("with_control", [False, True])
-def test_a_block_in_parts_is_that_of_one_solve(
-    block: Any, in_parts: Callable[..., set[int]], with_control: bool
-) -> None:
+def test_parts_give_the_block_of_one_solve(block: Any, in_parts: InParts, with_control: bool) -> None:
     truth, images, observations, passes = block
     point = np.unique(observations.point)[:: len(truth) // 12].astype(np.int64)
     control = control_of(truth, point) if with_control else NO_CONTROL
@@ -116,9 +117,7 @@ def test_a_block_in_parts_is_that_of_one_solve(
     agree(parts, whole)
 
 
-def test_a_pass_of_all_images_does_not_join_the_parts(
-    block: Any, in_parts: Callable[..., set[int]]
-) -> None:
+def test_a_pass_of_all_images_does_not_join_the_parts(block: Any, in_parts: InParts) -> None:
     """Images whose time is unknown may all be of one pass."""
     _, images, observations, _ = block
     passes = [np.ones(len(images), dtype=np.bool_)]
@@ -127,9 +126,7 @@ def test_a_pass_of_all_images_does_not_join_the_parts(
     agree(adjust_block(images, observations, passes=passes), whole)
 
 
-def test_an_image_without_neighbours_stays_as_delivered(
-    block: Any, in_parts: Callable[..., set[int]]
-) -> None:
+def test_an_image_without_neighbours_stays_as_delivered(block: Any, in_parts: InParts) -> None:
     _, images, observations, passes = block
     alone = replace(images[0], name="alone")
     passes = [np.append(mask, False) for mask in passes]
@@ -153,9 +150,7 @@ def cut(observations: Observations) -> Observations:
     return replace(own, point=point.astype(np.int64))
 
 
-def test_groups_that_nothing_connects_are_refused_and_taken_with_control_of_each(
-    block: Any, in_parts: Callable[..., set[int]]
-) -> None:
+def test_groups_that_nothing_connects_need_control_of_each(block: Any, in_parts: InParts) -> None:
     _, images, observations, passes = block
     apart = cut(observations)
     problem = BlockProblem(images, apart, NO_CONTROL, BlockOptions(), int(apart.point[-1]) + 1, 6)
@@ -181,7 +176,7 @@ def test_groups_that_nothing_connects_are_refused_and_taken_with_control_of_each
     agree(parts, whole)
 
 
-def test_a_block_in_parts_is_tied_to_a_neighbour(block: Any, in_parts: Callable[..., set[int]]) -> None:
+def test_a_block_in_parts_is_tied_to_a_neighbour(block: Any, in_parts: InParts) -> None:
     _, images, observations, _ = block
     before = np.flatnonzero(np.arange(N_IMAGES) < 40)
     own = observations.take(observations.image < 40)
@@ -212,9 +207,7 @@ class Dying(Executor):
         return self.here.submit(fn, *args, **kwargs)
 
 
-def test_an_interrupted_adjustment_goes_on_and_is_the_same_bit_for_bit(
-    block: Any, in_parts: Callable[..., set[int]]
-) -> None:
+def test_an_interrupted_adjustment_goes_on_bit_for_bit(block: Any, in_parts: InParts) -> None:
     """In the robust start, and in the rounds of least squares."""
     _, images, observations, passes = block
     in_parts(2000)
@@ -238,9 +231,7 @@ def same_bits(one: BlockAdjustment, other: BlockAdjustment) -> None:
 
 
 @pytest.mark.long
-def test_other_processes_make_the_same_block_bit_for_bit(
-    block: Any, in_parts: Callable[..., set[int]]
-) -> None:
+def test_other_processes_make_the_same_block_bit_for_bit(block: Any, in_parts: InParts) -> None:
     _, images, observations, passes = block
     in_parts(2000)
     whole = adjust_block(images, observations, passes=passes)
@@ -249,8 +240,8 @@ def test_other_processes_make_the_same_block_bit_for_bit(
         same_bits(adjust_block(images, observations, passes=passes, work=work), whole)
 
 
-def test_no_part_has_more_than_its_share_and_every_observation_is_in_one(
-    block: Any, in_parts: Callable[..., set[int]]
+def test_every_observation_is_in_one_part_of_no_more_than_its_share(
+    block: Any, in_parts: InParts
 ) -> None:
     _, images, observations, _ = block
     in_parts()

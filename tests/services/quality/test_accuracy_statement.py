@@ -5,7 +5,6 @@ import pytest
 
 from amers.services.quality.accuracy_statement import (
     accuracy_document,
-    median_accuracy,
     no_accuracy,
     points_accuracy,
     scene_accuracy,
@@ -129,15 +128,6 @@ def test_vertices_of_a_scene_that_is_not_registered_have_the_accuracy_of_its_mod
         in_no_frame
         == "On the Earth: CE90 unknown: the sigma of the control points' common error is not stated"
     )
-
-
-def test_the_median_point_of_a_block_is_stated_without_and_with_its_frame() -> None:
-    stated = median_accuracy(3.0, 6.0, Frame.from_sigmas(4.0, 8.0))
-    ce90_of_one, le90_of_one = np.sqrt(2.0 * np.log(10.0)), 1.6449
-    for one, times in ((stated.relative_to_control_points, 3.0), (stated.on_the_earth, 5.0)):
-        assert one.ce90_m == pytest.approx(ce90_of_one * times, rel=1e-4)
-        assert one.le90_m == pytest.approx(le90_of_one * 2.0 * times, rel=1e-4)
-        assert "median of the points" in one.words
 
 
 def test_a_figure_that_is_unknown_is_null_in_a_document() -> None:

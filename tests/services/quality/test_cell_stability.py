@@ -1,6 +1,5 @@
 """Hold-outs by cells show errors that neighbours share, which hold-outs at random cannot."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +8,7 @@ import pytest
 from amers.services.errors import NotEnoughPoints
 from amers.services.quality.cell_stability import CELLS, cells_of, measure_cell_stability
 from amers.services.quality.stability import PLACES, image_places, measure_stability
-from tests.services.conftest import Registered
-
-pytestmark = pytest.mark.thorough
+from tests.services.conftest import Make
 
 SEEDS = range(12)
 
@@ -33,6 +30,7 @@ def medians(registered, **made):
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 @pytest.mark.parametrize("points_px", [0.0, 2.0])
 def test_with_independent_errors_both_find_what_is_predicted(registered, points_px):
@@ -42,6 +40,7 @@ def test_with_independent_errors_both_find_what_is_predicted(registered, points_
     assert over_stated == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 @pytest.mark.parametrize("shared_px", [0.4, 0.8])
 def test_errors_that_neighbours_share_show_by_cells_only(registered, shared_px):
@@ -51,6 +50,7 @@ def test_errors_that_neighbours_share_show_by_cells_only(registered, shared_px):
     assert over_stated < 1.6, "the stated accuracy knows most of them"
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 def test_a_model_that_bends_shows_by_cells_only(registered):
     at_random, by_cells, _ = medians(registered, bend_px=0.5)
@@ -58,6 +58,7 @@ def test_a_model_that_bends_shows_by_cells_only(registered):
     assert by_cells > 2.0
 
 
+@pytest.mark.thorough
 @pytest.mark.monte_carlo
 def test_errors_that_neighbours_share_move_the_corners_more_by_cells(registered):
     ratios = []
@@ -88,9 +89,7 @@ def test_every_active_point_is_held_out_once_with_its_whole_cell(registered):
     assert stability.held_out_px.xy.n == active.sum()
 
 
-def test_cells_divide_the_extent_of_the_points_wherever_in_the_image_it_lies(
-    registered: Callable[..., Registered],
-) -> None:
+def test_cells_divide_the_extent_of_the_points_wherever_in_the_image_it_lies(registered: Make) -> None:
     """Each cell is a quarter of the lines by a quarter of the samples that active points reach over."""
     measures = registered(n=300).measures
     here = cells_of(measures)

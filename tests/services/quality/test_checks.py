@@ -1,7 +1,5 @@
 """A registered model against ground that had no part in it."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
@@ -16,7 +14,7 @@ from amers.services.quality.check_points import (
 from amers.services.quality.qualification import QualificationOptions, qualify
 from amers.services.sensors.correction import CorrectedModel
 from amers.services.types import UNKNOWN_FRAME, Array, Frame
-from tests.services.conftest import GSD_M, METRE_DEG, SHAPE, FlatModel, Registered
+from tests.services.conftest import GSD_M, METRE_DEG, SHAPE, FlatModel, Make, Registered
 
 LIMIT = 3.0
 
@@ -82,9 +80,7 @@ def test_what_points_and_their_frame_state_is_expected_of_them(registered):
     assert checked(scene, stated).normalised.mean_square == pytest.approx(in_a_frame_of_a_metre)
 
 
-def test_points_known_half_as_well_are_a_quarter_of_the_evidence(
-    registered: Callable[..., Registered],
-) -> None:
+def test_points_known_half_as_well_are_a_quarter_of_the_evidence(registered: Make) -> None:
     scene = registered()
     points = check_points(scene, 40, 0.3, (20.0, 0.0))
     found = [
@@ -97,9 +93,7 @@ def test_points_known_half_as_well_are_a_quarter_of_the_evidence(
     assert found[0] / found[1] == pytest.approx(4.0, rel=1e-2)
 
 
-def test_residuals_twice_as_large_as_stated_are_within_a_limit_of_three(
-    registered: Callable[..., Registered],
-) -> None:
+def test_residuals_twice_as_large_as_stated_are_within_a_limit_of_three(registered: Make) -> None:
     scene = registered()
     good = qualify(scene.adjusted(), QualificationOptions(), np.random.default_rng(3))
     points = check_points(scene, 200, 1.0)
@@ -147,7 +141,7 @@ def test_errors_on_the_ground_are_small_across_180_degrees(registered):
     assert set(np.sign(points.lon_lat_h[:, 0])) == {-1.0, 1.0}
 
 
-def test_a_point_beside_the_scene_leaves_the_others(registered: Callable[..., Registered]) -> None:
+def test_a_point_beside_the_scene_leaves_the_others(registered: Make) -> None:
     scene = registered()
     points = check_points(scene, 40, 0.3)
     ground = points.lon_lat_h.copy()

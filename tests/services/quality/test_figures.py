@@ -10,7 +10,6 @@ from amers.services.quality.criteria import (
     at_least,
     at_most,
     verdict_of,
-    verdict_scope,
 )
 from amers.services.quality.predicted import predict_accuracy
 from amers.services.quality.qualification import unexplained_px
@@ -164,10 +163,3 @@ def test_the_worst_criterion_decides_whatever_the_order(unmet, verdict):
     criteria = [*met, *(at_most("displacement_px", 3.0, 2.0, grade) for grade in unmet)]
     assert verdict_of(tuple(criteria)) == verdict_of(tuple(criteria[::-1])) == verdict
     assert verdict in VERDICT_EXPLANATIONS
-
-
-def test_a_verdict_speaks_of_the_earth_where_a_limit_there_was_set():
-    relative = at_most("predicted_ce90_px", 1.0, 2.0, "good")
-    on_earth = at_most("ce90_on_earth_m", 1.0, 2.0, "usable")
-    assert verdict_scope((relative,)) == "relative to the control points"
-    assert verdict_scope((relative, on_earth)) == "relative to the control points and on the Earth"

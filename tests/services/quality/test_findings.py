@@ -1,6 +1,5 @@
 """What a correction does not follow harms the stated accuracy by its size, and no verdict otherwise."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,9 +12,7 @@ from amers.services.quality.normal_law import CIRCULAR_CE90
 from amers.services.quality.points_elsewhere import Elsewhere
 from amers.services.quality.qualification import Qualification, QualificationOptions, qualify
 from amers.services.quality.stability import AdjustedScene
-from tests.services.conftest import Registered
-
-Make = Callable[..., Registered]
+from tests.services.conftest import Make
 
 
 def qualified(scene: AdjustedScene) -> Qualification:

@@ -1,6 +1,5 @@
 """Heights that move points otherwise than the model says: what tells them, and what they harm."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,7 @@ from amers.services.quality.findings import with_findings
 from amers.services.quality.qualification import QualificationOptions, qualify
 from amers.services.quality.sight_errors import slope_of_growth
 from amers.services.types import Array
-from tests.services.conftest import Registered
+from tests.services.conftest import Make
 
 GSD_M = 0.5
 SIDE_PX = 2_000.0
@@ -146,7 +145,7 @@ def test_the_slope_knows_no_axes_no_origin_and_no_datum() -> None:
 
 @pytest.mark.parametrize(("relief_m", "verdict"), [(1.0, "good"), (60.0, "failed")])
 def test_another_line_of_sight_harms_by_the_relief_that_no_plane_follows(
-    registered: Callable[..., Registered], relief_m: float, verdict: str
+    registered: Make, relief_m: float, verdict: str
 ) -> None:
     """Points that were found lie on a plane, which the affine follows; some that were not lie beside."""
     scene = registered()
@@ -168,7 +167,7 @@ def test_another_line_of_sight_harms_by_the_relief_that_no_plane_follows(
     assert result.verdict == verdict
 
 
-def test_repeated_lines_on_a_hillside_are_no_other_view(registered: Callable[..., Registered]) -> None:
+def test_repeated_lines_on_a_hillside_are_no_other_view(registered: Make) -> None:
     """Sixty lines that are repeated in the middle displace what lies behind them up the slope."""
     scene = registered()
     measures = scene.measures

@@ -5,14 +5,10 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from amers.services.formats.block.document import rectangle
 from amers.services.production.block_plan import BlockPlan, PlannedImage, PlannedSite
 from amers.services.production.block_residuals import FITS, ImageFit, PointFits
 from amers.services.production.planning import Accuracy90, Forecast, ImageForecast, ProposedSite
 from amers.services.quality.accuracy_statement import median_accuracy
-from amers.services.quality.block_cells import block_cells
-from amers.services.quality.block_requirements import BlockRequirements
-from amers.services.quality.planimetry import planimetric_quality
 from amers.services.reports.block_adjustment import (
     ALL_FITS,
     LOOK_AT,
@@ -20,17 +16,11 @@ from amers.services.reports.block_adjustment import (
     ControlFit,
 )
 from amers.services.reports.block_quality import (
-    BlockIdentification,
-    Measured,
-    MeasuredErrors,
-    block_quality_report,
     degree_words,
 )
 from amers.services.reports.plan import PlanReport
 from amers.services.reports.selection import share_words
 from amers.services.types import Frame
-from tests.factories import control_points
-from tests.services.quality.test_planimetric_figures import FRAME, at_site
 
 WHEN = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
 RELATIVE, EARTH = Accuracy90(1.1, 1.2, 1.3, 1.4), Accuracy90(5.1, 5.2, 5.3, 5.4)
@@ -132,34 +122,6 @@ def test_a_block_is_looked_at_for_each_odd_image_and_each_contradiction(
 )
 def test_a_share_that_is_not_nothing_never_looks_like_it(share: float, words: str) -> None:
     assert share_words(share) == words
-
-
-def test_sites_are_judged_by_the_points_of_a_block_and_not_by_its_images() -> None:
-    points = control_points(60, np.random.default_rng(5), (5.0, 43.0, 5.2, 43.1))
-    outline = rectangle(5.0, 43.0, 5.2, 43.1)
-    rng = np.random.default_rng(6)
-    near, far = (at_site("harbour", rng.normal(0.0, sigma_m, (80, 2))) for sigma_m in (0.3, 9.0))
-    measured = Measured(
-        None,
-        (planimetric_quality([near], "points", FRAME), planimetric_quality([far], "images", FRAME)),
-        MeasuredErrors(outline, None, (near, far)),
-    )
-    report = block_quality_report(
-        BlockIdentification("b", "1", "a block", WHEN),
-        points,
-        block_cells(points, outline, 2, WHEN),
-        BlockRequirements(ce90_m=2.0),
-        measured,
-        assessed_at=WHEN,
-        seconds=1.0,
-        software_version="0.1.0",
-    )
-    (place,) = report.places
-    assert (place.place, place.outcome, place.limit) == ("site harbour", "met", 2.0)
-    assert place.value == pytest.approx(0.3 * 2.146, rel=0.2)
-    assert report.verdict == "met"
-    assert report.block.excluded_km2 == pytest.approx(0.0, abs=1e-6)
-    assert report.density.points_per_km2 == pytest.approx(60 / report.block.area_km2)
 
 
 @pytest.mark.parametrize(

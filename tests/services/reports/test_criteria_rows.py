@@ -1,6 +1,5 @@
 """What a page lists of criteria, residuals and points: the worst and the commonest first."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -8,11 +7,9 @@ import pytest
 
 from amers.services.quality.criteria import Criterion, at_least, at_most
 from amers.services.reports.criteria_rows import NOT_USABLE, criterion_rows, unmet_criteria
-from amers.services.reports.published import published_tables
 from amers.services.reports.reasons import count_reasons
 from amers.services.reports.scene_words import centre_words
-from tests.services.conftest import Registered
-from tests.services.reports.conftest import Material
+from tests.services.conftest import Make
 
 CE90 = "predicted_ce90_px"
 UNIT_WEIGHT, POINTS = "unit_weight", "active_points"
@@ -50,8 +47,8 @@ def test_an_unmet_figure_is_listed_at_the_lowest_level_that_it_misses_and_the_lo
     assert [(one.name, one.needed_for) for one in unmet] == [(POINTS, "usable"), (CE90, "good")]
 
 
-def test_the_commonest_reason_stands_first_of_points_that_were_not_matched_and_of_others(
-    registered: Callable[..., Registered],
+def test_of_points_not_matched_and_of_others_the_commonest_reason_stands_first(
+    registered: Make,
 ) -> None:
     measures = registered(n=60, lost=20, wrong=6).measures
     codes = np.array(["cloud"] * 3 + ["low_score"] * 12 + ["nodata"] * 5, dtype="<U32")
@@ -66,29 +63,6 @@ def test_the_commonest_reason_stands_first_of_points_that_were_not_matched_and_o
         ("not matched", "cloud", 3),
         ("deactivated", "deactivated", len(deactivated)),
     ]
-
-
-def test_published_residuals_on_the_ground_are_east_before_north(
-    material: Callable[..., Material],
-) -> None:
-    report = material().report()
-    ground = report.ground_residuals_m
-    known = replace(
-        ground,
-        east=replace(ground.east, mean=1.0, std=3.0),
-        north=replace(ground.north, mean=2.0, std=4.0),
-    )
-    table = published_tables(replace(report, ground_residuals_m=known))[2]
-    assert table.values[:4] == (1.0, 2.0, 3.0, 4.0)
-
-
-def test_published_tables_say_the_share_of_points_that_is_kept_and_that_is_held_out(
-    material: Callable[..., Material],
-) -> None:
-    report = material().report()
-    kept = replace(report, stability=replace(report.stability, kept_share=0.7))
-    titles = [table.title for table in published_tables(kept)]
-    assert titles[3:] == ["Displacement with 70 % of the points, m", "Points held out (30 %), m"]
 
 
 @pytest.mark.parametrize(

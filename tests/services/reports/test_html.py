@@ -157,21 +157,6 @@ def test_the_residual_arrows_point_where_the_residuals_do(material):
     np.testing.assert_allclose(right, 2.0 * down, atol=a_printed_digit)
 
 
-def test_the_funnel_ends_at_the_point_counts(report):
-    drawn = figure_markup(funnel, report)
-    bar = r'<rect x="([\d.]+)" [^>]*width="([\d.]+)"[^>]*><title>([^<]+): (\d+)</title>'
-    bars = {name: (float(x), float(w), int(n)) for x, w, name, n in re.findall(bar, drawn)}
-    counts = report.point_counts
-    left, width, _ = bars["visible"]
-    assert bars["visible"][2] == counts.visible
-    assert bars["matched"][2] == counts.matched
-    assert bars["active"][2] == counts.active
-    for name in ("matched", "active"):
-        assert bars[name][1] == pytest.approx(width * bars[name][2] / counts.visible, abs=0.02)
-    lost_from = (bars["beyond 2.7 sigma"][0] - left) / width * counts.visible
-    assert lost_from == pytest.approx(counts.active, abs=0.02 * counts.visible / width)
-
-
 def test_what_a_figure_draws_of_hostile_labels_is_text(material):
     made = material()
     reason = np.where(made.measures.active, "", HOSTILE)
