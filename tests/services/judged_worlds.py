@@ -61,6 +61,7 @@ from tests.services.quality import test_checks as checks
 from tests.services.quality import test_findings as findings
 from tests.services.quality import test_held_area as held
 from tests.services.quality import test_line_of_sight as sights
+from tests.services.quality import test_planimetric_figures as placed
 from tests.services.quality import test_sight_errors as hillsides
 from tests.services.quality import test_site_images as sites
 from tests.services.quality import test_vanished as vanished
@@ -292,19 +293,15 @@ def _quality_of_a_block() -> Any:
 def _at_site(rng: np.random.Generator, name: str, source: str) -> SiteErrors:
     n, place = 40, np.array([5.5 if name == "west" else 6.5, 43.4])
     error_m = rng.normal([0.4, -0.9], [0.8, 1.6], (n, 2))
-    covariance_m2 = np.tile(UNEQUAL_M2[:2, :2], (n, 1, 1))
-    if source != POINTS:
-        covariance_m2[:] = np.nan
-    return SiteErrors(
-        name=name,
-        is_control=name == "west",
+    stated_m2 = np.tile(UNEQUAL_M2[:2, :2] * (1.0 if source == POINTS else np.nan), (n, 1, 1))
+    return replace(
+        placed.at_site(name, error_m, control=name == "west"),
         source=source,
         incidence_deg=12.0,
         tried=n + 7,
         reach_m=9.0 + n,
         lon_lat=place + rng.uniform(-0.1, 0.1, (n, 2)),
-        error_m=error_m,
-        covariance_m2=covariance_m2,
+        covariance_m2=stated_m2,
         frame_m2=np.diag([0.3, 0.5]),
         reasons=(("flat", 3), ("cloud", 4)),
     )

@@ -9,12 +9,7 @@ import pytest
 from amers.services.adjustment.intersected_marks import IntersectedMarks
 from amers.services.matching.systematic_error import _student_factor
 from amers.services.quality.accuracy import sample_quantile, statistics
-from amers.services.quality.normal_law import (
-    CIRCULAR_CE90,
-    LINEAR_LE90,
-    normal_ce90,
-    overall_ce90,
-)
+from amers.services.quality.normal_law import CIRCULAR_CE90, LINEAR_LE90, normal_ce90, overall_ce90
 
 CHI2_90_OF_2 = 4.605
 """Of 2 degrees of freedom, as all tables of the chi-square distribution have it."""
@@ -63,12 +58,7 @@ def test_without_redundancy_a_scale_has_no_chance() -> None:
 
 
 @pytest.mark.parametrize(
-    ("count", "lower", "upper"),
-    [
-        (28, 22.0, None),
-        (29, 23.0, 29.0),
-        (100, 85.0, 96.0),
-    ],
+    ("count", "lower", "upper"), [(28, 22.0, None), (29, 23.0, 29.0), (100, 85.0, 96.0)]
 )
 def test_order_statistics_bound_a_quantile_as_the_binomial_table_says(
     count: int, lower: float, upper: float | None

@@ -11,6 +11,7 @@ from amers.services.errors import NoConsensus
 from amers.services.geodesy import move_metres
 from amers.services.types import UNKNOWN_FRAME, Array, Frame, Observations
 from benchmarks.block_coverage import Case, draw
+from tests.services.adjustment.grounds import ground_of
 from tests.services.ties import difference_m
 
 point_sigma_m = 0.3
@@ -25,14 +26,8 @@ def known_ground(truth: Array, rng: np.random.Generator, wrong: int = 0) -> Cont
     """Points with their own errors and one of their frame; the first `wrong` are 15 m off besides."""
     error_m = rng.normal(0.0, point_sigma_m, (count, 3)) + rng.normal(0.0, frame_sigma_m, 3)
     error_m[:wrong] += rng.choice([-15.0, 15.0], (wrong, 3))
-    return ControlGround(
-        point=np.arange(count, dtype=np.int64),
-        lon_lat_h=move_metres(truth[:count], error_m),
-        covariance_m2=np.tile(np.eye(3) * point_sigma_m**2, (count, 1, 1)),
-        source=np.zeros(count, dtype=np.int64),
-        frames=(FRAME,),
-        names=tuple(f"P{k + 1}" for k in range(count)),
-    )
+    known = move_metres(truth[:count], error_m)
+    return ground_of(np.arange(count), known, np.eye(3) * point_sigma_m**2, FRAME)
 
 
 def frame_error_m(block: BlockAdjustment, truth: Array) -> Array:

@@ -19,6 +19,7 @@ from amers.services.geodesy import move_metres
 from amers.services.tasks import Arrays, Here, Work
 from amers.services.types import Array, BoolArray, Frame, IntArray, Observations
 from benchmarks.block_adjustment import large_block
+from tests.services.adjustment.grounds import ground_of
 
 N_IMAGES, PER_IMAGE = 64, 60
 of_a_sigma = 0.01
@@ -60,15 +61,12 @@ def control_of(truth: Array, point: IntArray) -> ControlGround:
     """Known points in two frames; the first point is 15 m off, the second has no known height."""
     rng = np.random.default_rng(4)
     frame_m = rng.normal(0.0, 0.8, (2, 3))
-    source = np.arange(len(point), dtype=np.int64) % 2
-    error_m = rng.normal(0.0, 0.3, (len(point), 3)) + frame_m[source]
+    error_m = rng.normal(0.0, 0.3, (len(point), 3)) + frame_m[np.arange(len(point)) % 2]
     error_m[0] += 15.0
-    covariance_m2 = np.tile(np.eye(3) * 0.09, (len(point), 1, 1))
-    covariance_m2[1, 2, 2] = np.inf
     frames = (Frame.from_sigmas(0.8, 0.8), Frame.from_sigmas(0.8, 0.8))
-    names = tuple(f"P{k}" for k in point.tolist())
-    ground = move_metres(truth[point], error_m)
-    return ControlGround(point, ground, covariance_m2, source, frames, names)
+    known = ground_of(point, move_metres(truth[point], error_m), np.eye(3) * 0.09, *frames)
+    known.covariance_m2[1, 2, 2] = np.inf
+    return known
 
 
 def agree(parts: BlockAdjustment, whole: BlockAdjustment) -> None:

@@ -6,6 +6,7 @@ import pytest
 from amers.services.adjustment.block_scale import low_scale, magnitude, posterior_scale, robust_scale
 from amers.services.adjustment.control_ground import ControlGround, joined_ground
 from amers.services.types import Frame, IntArray
+from tests.services.adjustment.grounds import ground_of
 
 RAYS, POINTS, SHARED = 3, 30, 24
 NOISE = 1.5
@@ -37,11 +38,7 @@ def test_the_scale_is_that_of_the_noise_whatever_the_points_share() -> None:
 
 def control(point: IntArray, *frames: Frame) -> ControlGround:
     """Points that come from some sources in turn."""
-    count = len(point)
-    source = np.arange(count) % len(frames)
-    names = tuple(str(one) for one in point.tolist())
-    covariance_m2 = np.tile(np.eye(3), (count, 1, 1))
-    return ControlGround(point, np.zeros((count, 3)), covariance_m2, source, frames, names)
+    return ground_of(point, np.zeros((len(point), 3)), np.eye(3), *frames)
 
 
 def test_points_of_joined_control_keep_their_frames() -> None:

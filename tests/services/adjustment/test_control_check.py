@@ -19,6 +19,7 @@ from amers.services.adjustment.robust_start import active_observations, robust_s
 from amers.services.adjustment.settled_block import judged
 from amers.services.geodesy import move_metres
 from amers.services.types import Array, BoolArray, Frame, Observations
+from tests.services.adjustment.grounds import ground_of
 from tests.services.simulated import ring_of_geometries
 from tests.services.ties import difference_m, make_ties
 
@@ -57,15 +58,7 @@ class Block:
 
     def without_the_first(self) -> ControlGround:
         """The other known points."""
-        control = self.control
-        return ControlGround(
-            control.point[1:],
-            control.lon_lat_h[1:],
-            control.covariance_m2[1:],
-            control.source[1:],
-            control.frames,
-            control.names[1:],
-        )
+        return self.control.take(np.arange(1, len(self.control)))
 
     def judged(self, active: BoolArray) -> BoolArray:
         """The known points that agree after a solution in which some take part."""
@@ -94,14 +87,8 @@ def block() -> Block:
         image_parameters(g.plan.image_id, g.rpc, g.plan.shape, shift_px=8.0, order="shift")
         for g in geometries
     ]
-    control = ControlGround(
-        np.arange(KNOWN, dtype=np.int64),
-        ties.lon_lat_h[:KNOWN],
-        np.tile(np.diag(OWN_SIGMA_M**2), (KNOWN, 1, 1)),
-        np.zeros(KNOWN, dtype=np.int64),
-        (EXACT_FRAME,),
-        tuple(f"P{k + 1}" for k in range(KNOWN)),
-    )
+    own_m2 = np.diag(OWN_SIGMA_M**2)
+    control = ground_of(np.arange(KNOWN), ties.lon_lat_h[:KNOWN], own_m2, EXACT_FRAME)
     return Block(images, ties.observations, control)
 
 

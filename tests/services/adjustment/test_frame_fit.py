@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from amers.services.adjustment.control_ground import ControlGround
 from amers.services.adjustment.frame_fit import FrameFit, fit_frame
 from amers.services.errors import NoConsensus
 from amers.services.geodesy import move_metres
 from amers.services.types import Array, Frame
+from tests.services.adjustment.grounds import ground_of
 
 BEFORE = Frame(np.diag([5.0, 4.0, 8.0]) ** 2)
 SOURCE = Frame.from_sigmas(0.3, 0.5)
@@ -26,15 +26,8 @@ def drawn(
     found = move_metres(ground, rng.normal(0.0, FOUND_M, (count, 3)) - frame_m)
     error_m = rng.normal(0.0, KNOWN_M, (count, 3)) + source_m
     error_m[:wrong] += rng.choice([-1.0, 1.0], (wrong, 3)) * rng.uniform(6.0, 30.0, (wrong, 3))
-    variance = np.where(known, KNOWN_M**2, np.inf)
-    control = ControlGround(
-        point=np.arange(count),
-        lon_lat_h=move_metres(ground, error_m),
-        covariance_m2=np.where(np.eye(3) > 0, variance, 0.0) * np.ones((count, 1, 1)),
-        source=np.zeros(count, dtype=np.int64),
-        frames=(SOURCE,),
-        names=tuple(f"survey:{k}" for k in range(count)),
-    )
+    own_m2 = np.where(np.eye(3) > 0, np.where(known, KNOWN_M**2, np.inf), 0.0)
+    control = ground_of(np.arange(count), move_metres(ground, error_m), own_m2, SOURCE, name="survey:")
     own = np.tile(np.diag(FOUND_M**2), (count, 1, 1))
     return fit_frame(BEFORE, control, found, own), frame_m
 
@@ -69,14 +62,8 @@ def test_positions_alone_leave_the_height_as_it_was() -> None:
 def test_what_nobody_stated_and_nothing_tells_stays_unknown() -> None:
     rng = np.random.default_rng(6)
     ground = np.array([5.4, 43.6, 100.0]) + np.zeros((6, 3))
-    control = ControlGround(
-        point=np.arange(6),
-        lon_lat_h=move_metres(ground, np.tile([3.0, -2.0, 0.0], (6, 1)) + rng.normal(0, 0.1, (6, 3))),
-        covariance_m2=np.tile(np.diag([0.01, 0.01, np.inf]), (6, 1, 1)),
-        source=np.zeros(6, dtype=np.int64),
-        frames=(SOURCE,),
-        names=("one",) * 6,
-    )
+    known = move_metres(ground, [3.0, -2.0, 0.0] + rng.normal(0, 0.1, (6, 3)))
+    control = ground_of(np.arange(6), known, np.diag([0.01, 0.01, np.inf]), SOURCE)
     unknown = Frame(np.full((3, 3), np.nan))
     fit = fit_frame(unknown, control, ground, np.tile(0.01 * np.eye(3), (6, 1, 1)))
     assert fit.translation_m == pytest.approx([3.0, -2.0, 0.0], abs=0.2)
@@ -86,14 +73,8 @@ def test_what_nobody_stated_and_nothing_tells_stays_unknown() -> None:
 
 def test_what_neighbours_share_stays_in_the_frame() -> None:
     shared = Frame(BEFORE.covariance_m2, np.diag([0.5, 0.5, 2.0]))
-    control = ControlGround(
-        point=np.arange(50),
-        lon_lat_h=np.tile([5.4, 43.6, 100.0], (50, 1)),
-        covariance_m2=np.tile(1e-4 * np.eye(3), (50, 1, 1)),
-        source=np.zeros(50, dtype=np.int64),
-        frames=(Frame.from_sigmas(0.01, 0.01),),
-        names=("one",) * 50,
-    )
+    known = np.tile([5.4, 43.6, 100.0], (50, 1))
+    control = ground_of(np.arange(50), known, 1e-4 * np.eye(3), Frame.from_sigmas(0.01, 0.01))
     fit = fit_frame(shared, control, control.lon_lat_h, np.tile(np.eye(3), (50, 1, 1)))
     assert fit.frame.covariance_m2[0, 0] > 0.25
     assert fit.frame.shared_m2[2, 2] == 2.0

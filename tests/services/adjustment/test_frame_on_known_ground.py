@@ -11,6 +11,7 @@ from amers.services.adjustment.control_ground import ControlGround
 from amers.services.adjustment.frame_fit import fit_frame
 from amers.services.geodesy import move_metres
 from amers.services.types import Array, Frame, IntArray
+from tests.services.adjustment.grounds import ground_of
 
 STAYS = 0.9999
 COUNT = 5
@@ -33,14 +34,8 @@ OF_KNOWN, OF_FOUND = (covariances(np.random.default_rng(k), size) for k, size in
 
 def known_ground(off_m: Array) -> ControlGround:
     """Known ground that lies so far (n, 3) from where the block has it."""
-    return ControlGround(
-        np.arange(COUNT, dtype=np.int64),
-        move_metres(PLACE, off_m),
-        OF_KNOWN,
-        SOURCE,
-        SOURCES,
-        tuple(f"P{k + 1}" for k in range(COUNT)),
-    )
+    known = ground_of(np.arange(COUNT), move_metres(PLACE, off_m), OF_KNOWN, *SOURCES)
+    return replace(known, source=SOURCE)
 
 
 def drawn(seed: int) -> Array:

@@ -17,6 +17,7 @@ from amers.services.sensors.correction import CorrectedModel, ImageCorrection
 from amers.services.sensors.displacement import DisplacementGrid
 from amers.services.types import Array, Frame, IntArray, Observations
 from benchmarks.block_coverage import SHIFT_PX, Case, draw, whitened_square
+from tests.services.adjustment.grounds import ground_of
 from tests.services.conftest import SHAPE, FlatModel
 from tests.services.ties import difference_m
 
@@ -54,14 +55,9 @@ def of_images(observations: Observations, rows: Sequence[int]) -> Observations:
 
 def known_ground(truth: Array, point: IntArray, rng: np.random.Generator) -> ControlGround:
     error_m = rng.normal(0.0, POINT_SIGMA_M, (len(point), 3)) + rng.normal(0.0, FRAME_SIGMA_M, 3)
-    return ControlGround(
-        point=point,
-        lon_lat_h=move_metres(truth[point], error_m),
-        covariance_m2=np.tile(np.eye(3) * POINT_SIGMA_M**2, (len(point), 1, 1)),
-        source=np.zeros(len(point), dtype=np.int64),
-        frames=(Frame.from_sigmas(FRAME_SIGMA_M, FRAME_SIGMA_M),),
-        names=tuple(f"P{k}" for k in point.tolist()),
-    )
+    frame = Frame.from_sigmas(FRAME_SIGMA_M, FRAME_SIGMA_M)
+    known = move_metres(truth[point], error_m)
+    return ground_of(point, known, np.eye(3) * POINT_SIGMA_M**2, frame)
 
 
 @cache

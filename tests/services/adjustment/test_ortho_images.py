@@ -11,7 +11,7 @@ from amers.services.errors import InputError, NotEnoughPoints
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.types import Array, BoolArray, Frame, Observations
 from benchmarks._cape_verde import ORTHO, SITES, STEREO, Draw, draw
-from tests.services.ties import difference_m
+from tests.services.ties import difference_m, whitened_square
 
 TIES = 180
 DRAWS = 4
@@ -28,8 +28,7 @@ def squares(block: BlockAdjustment, one: Draw, coordinates: slice) -> tuple[Arra
     covariance_m2 = (block.point_covariance_m2[rows] + block.frames[0].covariance_m2)[
         :, coordinates, coordinates
     ]
-    whitened = np.linalg.solve(covariance_m2, error_m[:, :, None])[:, :, 0]
-    return rows, (error_m * whitened).mean(axis=1)
+    return rows, whitened_square(error_m, covariance_m2)
 
 
 @pytest.mark.thorough

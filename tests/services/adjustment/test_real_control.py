@@ -16,6 +16,7 @@ from amers.services.imagery.scene import Scene, scene_gsd_m
 from amers.services.imagery.source import Window
 from amers.services.types import Array, Frame, Observations
 from tests.journeys.ties import independent_tracks
+from tests.services.adjustment.grounds import ground_of
 from tests.services.ties import difference_m
 
 pytestmark = pytest.mark.real_data
@@ -86,15 +87,9 @@ def control(
     frame_error_m = rng.multivariate_normal(np.zeros(3), FRAME.covariance_m2)
     error_m = rng.normal(0.0, point_sigma_m, (handful, 3)) + frame_error_m
     error_m[:wrong] += rng.choice([-blunder_m, blunder_m], (wrong, 3))
-    ground = ControlGround(
-        point=rows.astype(np.int64),
-        lon_lat_h=move_metres(base.lon_lat_h[rows], error_m),
-        covariance_m2=base.point_covariance_m2[rows] + np.eye(3) * point_sigma_m**2,
-        source=np.zeros(handful, dtype=np.int64),
-        frames=(FRAME,),
-        names=tuple(f"point {k + 1}" for k in range(handful)),
-    )
-    return ground, frame_error_m
+    own_m2 = base.point_covariance_m2[rows] + np.eye(3) * point_sigma_m**2
+    known = move_metres(base.lon_lat_h[rows], error_m)
+    return ground_of(rows, known, own_m2, FRAME, name="point "), frame_error_m
 
 
 def frame_error_m(block: BlockAdjustment, base: BlockAdjustment, without: Array) -> Array:

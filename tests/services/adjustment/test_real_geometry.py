@@ -14,6 +14,7 @@ from amers.services.formats.sensor_models.dimap import parse_dimap_rpc
 from amers.services.geodesy import move_metres
 from amers.services.quality.accuracy import normalised_error
 from amers.services.types import Array, Frame, Observations
+from tests.services.adjustment.grounds import ground_of
 from tests.services.ties import difference_m
 
 pytestmark = pytest.mark.real_data
@@ -98,14 +99,8 @@ def base(truth: Array, seen: Array, rng: np.random.Generator) -> ControlGround:
     """A few of the points from a base that is off by an error of its own."""
     known = rng.choice(seen, CONTROL, replace=False)
     off_m = rng.multivariate_normal(np.zeros(3), BASE.covariance_m2)
-    return ControlGround(
-        point=known,
-        lon_lat_h=move_metres(truth[known], off_m + rng.normal(0.0, CONTROL_M, (CONTROL, 3))),
-        covariance_m2=np.tile(CONTROL_M**2 * np.eye(3), (CONTROL, 1, 1)),
-        source=np.zeros(CONTROL, dtype=np.int64),
-        frames=(BASE,),
-        names=tuple(f"point {number}" for number in range(CONTROL)),
-    )
+    ground = move_metres(truth[known], off_m + rng.normal(0.0, CONTROL_M, (CONTROL, 3)))
+    return ground_of(known, ground, CONTROL_M**2 * np.eye(3), BASE)
 
 
 @pytest.mark.parametrize("control", [False, True])

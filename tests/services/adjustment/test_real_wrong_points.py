@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from amers.services.adjustment.bundle import adjust_block
-from amers.services.adjustment.control_ground import ControlGround
 from amers.services.adjustment.rigorous_parameters import rigorous_parameters
 from amers.services.errors import InputError
 from amers.services.formats.sensor_models.rigorous_model import read_rigorous_model
 from amers.services.sensors.parameter_sets import PARAMETER_SETS
 from amers.services.sensors.pushbroom import PushbroomModel
 from amers.services.types import Frame, Observations
+from tests.services.adjustment.grounds import ground_of
 
 pytestmark = pytest.mark.real_data
 
@@ -31,15 +31,8 @@ def test_points_of_the_twin_instrument_are_refused_with_how_far_off_they_are(
     ground = np.array([[float(row[key]) for key in ("lon", "lat", "alt")] for row in rows])
     marks = np.array([[float(row[key]) for key in ("yPix", "xPix")] for row in rows])
     number = np.arange(len(rows))
-    control = ControlGround(
-        point=number,
-        lon_lat_h=ground,
-        covariance_m2=np.tile(point_sigma_m**2 * np.eye(3), (len(rows), 1, 1)),
-        source=np.zeros_like(number),
-        frames=(Frame.from_sigmas(10.0, 10.0),),
-        names=tuple(f"GCP {k}" for k in number),
-        by_hand=np.ones(len(rows), dtype=np.bool_),
-    )
+    own_m2, frame = point_sigma_m**2 * np.eye(3), Frame.from_sigmas(10.0, 10.0)
+    control = ground_of(number, ground, own_m2, frame, by_hand=True)
     observations = Observations(number, np.zeros_like(number), marks, np.full(len(rows), mark_sigma_px))
     model = read_rigorous_model(folder / "spot1-5_dimap" / "SP-2.DIM")
     assert isinstance(model, PushbroomModel)

@@ -23,10 +23,7 @@ def test_blocks_of_pairs_are_those_of_the_dense_inverse() -> None:
     design = sparse.coo_matrix(
         (
             rng.normal(size=2 * SIZE * len(point)),
-            (
-                np.repeat(rows, SIZE),
-                (np.repeat(image, 2)[:, None] * SIZE + np.arange(SIZE)).ravel(),
-            ),
+            (np.repeat(rows, SIZE), (np.repeat(image, 2)[:, None] * SIZE + np.arange(SIZE)).ravel()),
         )
     ).tocsr()
     matrix = (design.T @ design + sparse.identity(design.shape[1])).tocsc()

@@ -120,8 +120,7 @@ def test_what_displaces_an_ortho_image_is_followed_with_the_stated_accuracy(
 
 
 @pytest.mark.parametrize(
-    ("scanned", "points_px", "along"),
-    [(False, 0.1, {"image"}), (False, 3.0, set()), (True, 0.1, set())],
+    ("scanned", "points_px", "along"), [(False, 0.1, {"image"}), (False, 3.0, set()), (True, 0.1, set())]
 )
 def test_lines_and_samples_together_displace_an_ortho_image_alone(
     scanned: bool, points_px: float, along: set[str]

@@ -5,14 +5,7 @@ import pytest
 
 from amers.services.misfit.displacement_components import Component
 from amers.services.misfit.unseen_seams import unseen_seams
-from tests.services.misfit.test_displacement_components import (
-    SHAPE,
-    WRONG,
-    Motion,
-    both,
-    seam,
-    trial,
-)
+from tests.services.misfit.test_displacement_components import SHAPE, WRONG, Motion, both, seam, trial
 
 SAMPLES = 3000
 POINTS = np.linspace(100.0, 1900.0, 60)

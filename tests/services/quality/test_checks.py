@@ -1,5 +1,7 @@
 """A registered model against ground that had no part in it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -75,7 +77,7 @@ def test_what_points_and_their_frame_state_is_expected_of_them(registered):
     points = check_points(scene, 40, 0.3, (2.0, 0.0))
     strict = checked(scene, points).normalised.mean_square
     in_a_frame_of_a_metre = checked(scene, points, Frame.from_sigmas(1.0, 1.0)).normalised.mean_square
-    stated = CheckPoints(points.lon_lat_h, points.line_sample, np.ones((40, 3)), points.sigma_px)
+    stated = replace(points, sigma_m=np.ones((40, 3)))
     assert in_a_frame_of_a_metre < strict / 4.0
     assert checked(scene, stated).normalised.mean_square == pytest.approx(in_a_frame_of_a_metre)
 
@@ -84,10 +86,7 @@ def test_points_known_half_as_well_are_a_quarter_of_the_evidence(registered: Mak
     scene = registered()
     points = check_points(scene, 40, 0.3, (20.0, 0.0))
     found = [
-        checked(
-            scene,
-            CheckPoints(points.lon_lat_h, points.line_sample, np.full((40, 3), m), points.sigma_px),
-        ).normalised.mean_square
+        checked(scene, replace(points, sigma_m=np.full((40, 3), m))).normalised.mean_square
         for m in (20.0, 40.0)
     ]
     assert found[0] / found[1] == pytest.approx(4.0, rel=1e-2)
@@ -97,7 +96,7 @@ def test_residuals_twice_as_large_as_stated_are_within_a_limit_of_three(register
     scene = registered()
     good = qualify(scene.adjusted(), QualificationOptions(), np.random.default_rng(3))
     points = check_points(scene, 200, 1.0)
-    half = CheckPoints(points.lon_lat_h, points.line_sample, points.sigma_m, points.sigma_px / 2.0)
+    half = replace(points, sigma_px=points.sigma_px / 2.0)
     judged = with_check_points(good, checked(scene, half), LIMIT)
     assert judged.verdict == "good"
     assert judged.criteria[-1].value == pytest.approx(2.0, rel=0.1)
@@ -106,7 +105,7 @@ def test_residuals_twice_as_large_as_stated_are_within_a_limit_of_three(register
 def test_marks_without_a_sigma_have_that_of_a_person(registered):
     scene = registered()
     points = check_points(scene, 200, MARKING_SIGMA_PX)
-    unstated = CheckPoints(points.lon_lat_h, points.line_sample, points.sigma_m, np.full(200, np.nan))
+    unstated = replace(points, sigma_px=np.full(200, np.nan))
     assert checked(scene, unstated) == checked(scene, points)
 
 
@@ -146,13 +145,13 @@ def test_a_point_beside_the_scene_leaves_the_others(registered: Make) -> None:
     points = check_points(scene, 40, 0.3)
     ground = points.lon_lat_h.copy()
     ground[0] = np.nan
-    result = checked(scene, CheckPoints(ground, points.line_sample, points.sigma_m, points.sigma_px))
+    result = checked(scene, replace(points, lon_lat_h=ground))
     assert result.accuracy.n == result.residual_px.xy.n == result.normalised.n == 39
 
 
 def test_points_beside_the_scene_are_refused_by_number(registered):
     scene = registered()
     points = check_points(scene, 3, 0.3)
-    nowhere = CheckPoints(np.full((3, 3), np.nan), points.line_sample, points.sigma_m, points.sigma_px)
+    nowhere = replace(points, lon_lat_h=np.full((3, 3), np.nan))
     with pytest.raises(CoverageError, match="none of the 3 check points"):
         checked(scene, nowhere)

@@ -5,12 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from amers.services.quality.criteria import (
-    VERDICT_EXPLANATIONS,
-    at_least,
-    at_most,
-    verdict_of,
-)
+from amers.services.quality.criteria import VERDICT_EXPLANATIONS, at_least, at_most, verdict_of
 from amers.services.quality.predicted import predict_accuracy
 from amers.services.quality.qualification import unexplained_px
 from amers.services.types import Array, Frame

@@ -26,11 +26,7 @@ def tried(agreeing: Array, *, missed: Array = NOBODY, elsewhere: Array = NOBODY)
 
 
 def held(
-    agreeing: Array,
-    parts: Array | None = None,
-    *,
-    missed: Array = NOBODY,
-    elsewhere: Array = NOBODY,
+    agreeing: Array, parts: Array | None = None, *, missed: Array = NOBODY, elsewhere: Array = NOBODY
 ) -> HeldArea:
     return held_area(tried(agreeing, missed=missed, elsewhere=elsewhere), SHAPE, CHIP_PX, parts)
 

@@ -119,10 +119,7 @@ def test_the_errors_of_the_points_are_found_at_a_site() -> None:
 @pytest.mark.long
 def test_check_only_sites_are_told_apart_from_control_sites() -> None:
     points, chips = block()
-    sites = [
-        site("west", *WEST, is_control=True),
-        site("east", *EAST, displaced_px=(-3.0, 2.0)),
-    ]
+    sites = [site("west", *WEST, is_control=True), site("east", *EAST, displaced_px=(-3.0, 2.0))]
     errors = [point_errors(points, chips, one) for one in sites]
     quality = planimetric_quality(errors, "points", points.frames[0])
     together, check_only, control = quality.groups

@@ -46,9 +46,7 @@ def test_a_clean_registration_is_good(registered):
     assert failed(result) == set()
 
 
-def test_criteria_show_hundredths_of_pixels_and_metres_and_whole_percents(
-    registered: Make,
-) -> None:
+def test_criteria_show_hundredths_of_pixels_and_metres_and_whole_percents(registered: Make) -> None:
     """What a reader compares with a limit has the digits in which limits are given."""
     scene = registered().adjusted()
     criteria = qualify(scene, DEFAULT, np.random.default_rng(3)).criteria
@@ -225,11 +223,7 @@ def test_the_area_on_the_ground_is_where_the_registered_model_has_it(registered)
 )
 def test_each_threshold_costs_its_verdict(registered, field, limit, lost):
     in_pixels = replace(
-        DEFAULT,
-        good_displacement_m=0.0,
-        good_ce90_m=0.0,
-        usable_displacement_m=0.0,
-        usable_ce90_m=0.0,
+        DEFAULT, good_displacement_m=0.0, good_ce90_m=0.0, usable_displacement_m=0.0, usable_ce90_m=0.0
     )
     result = qualified(registered(), replace(in_pixels, **{field: limit}))
     assert failed(result) == {lost}

@@ -9,32 +9,21 @@ from amers.services.quality.structure_words import structure_words
 SHAPE = (4000, 3000)
 
 
-def words_of(family: Family, shape: str = "period", at: float = 800.0) -> str:
-    structure = Structure(family, 1e-9, shape, at, np.full(2, 2.5), 5.0, np.full(2, np.nan))
-    return structure_words(structure, SHAPE)
-
-
 @pytest.mark.parametrize(
-    ("family", "words"),
+    ("family", "shape", "words"),
     [
-        ("lines", "attitude jitter"),
-        ("samples", "seams between detectors"),
-        ("image", "errors of the terrain"),
+        ("lines", "period", "attitude jitter"),
+        ("samples", "period", "seams between detectors"),
+        ("image", "period", "errors of the terrain"),
+        ("steps", "step", "at line 800. Possible cause: lines that were lost"),
+        ("seams", "step", "at sample 800. Possible cause: a seam between detectors"),
     ],
 )
-def test_a_structure_says_what_it_looks_like(family: Family, words: str) -> None:
-    assert words in words_of(family)
-
-
-@pytest.mark.parametrize(
-    ("family", "words"),
-    [
-        ("steps", "at line 800. Possible cause: lines that were lost"),
-        ("seams", "at sample 800. Possible cause: a seam between detectors"),
-    ],
-)
-def test_a_step_says_where_it_is_and_what_it_looks_like(family: Family, words: str) -> None:
-    assert words in words_of(family, "step")
+def test_a_structure_says_where_it_is_and_what_it_looks_like(
+    family: Family, shape: str, words: str
+) -> None:
+    structure = Structure(family, 1e-9, shape, 800.0, np.full(2, 2.5), 5.0, np.full(2, np.nan))
+    assert words in structure_words(structure, SHAPE)
 
 
 @pytest.mark.parametrize(("period", "cause"), [(3900.0, "attitude jitter"), (4100.0, "a bow")])

@@ -9,15 +9,8 @@ from amers.services.production.block_plan import BlockPlan, PlannedImage, Planne
 from amers.services.production.block_residuals import FITS, ImageFit, PointFits
 from amers.services.production.planning import Accuracy90, Forecast, ImageForecast, ProposedSite
 from amers.services.quality.accuracy_statement import median_accuracy
-from amers.services.reports.block_adjustment import (
-    ALL_FITS,
-    LOOK_AT,
-    AdjustmentReport,
-    ControlFit,
-)
-from amers.services.reports.block_quality import (
-    degree_words,
-)
+from amers.services.reports.block_adjustment import ALL_FITS, LOOK_AT, AdjustmentReport, ControlFit
+from amers.services.reports.block_quality import degree_words
 from amers.services.reports.plan import PlanReport
 from amers.services.reports.selection import share_words
 from amers.services.types import Frame

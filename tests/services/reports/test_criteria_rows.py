@@ -47,9 +47,7 @@ def test_an_unmet_figure_is_listed_at_the_lowest_level_that_it_misses_and_the_lo
     assert [(one.name, one.needed_for) for one in unmet] == [(POINTS, "usable"), (CE90, "good")]
 
 
-def test_of_points_not_matched_and_of_others_the_commonest_reason_stands_first(
-    registered: Make,
-) -> None:
+def test_of_points_not_matched_and_of_others_the_commonest_reason_stands_first(registered: Make) -> None:
     measures = registered(n=60, lost=20, wrong=6).measures
     codes = np.array(["cloud"] * 3 + ["low_score"] * 12 + ["nodata"] * 5, dtype="<U32")
     reason = measures.reason.copy()

@@ -29,8 +29,7 @@ def validate(document):
 
 
 @pytest.mark.parametrize(
-    "of_registration",
-    [{}, {"n": 120, "extent": 0.5}, {"n": 5, "lost": 1, "wrong": 0}, {"compared": 0}],
+    "of_registration", [{}, {"n": 120, "extent": 0.5}, {"n": 5, "lost": 1, "wrong": 0}, {"compared": 0}]
 )
 def test_a_report_follows_its_schema(material, of_registration):
     validate(parsed(material(**of_registration).report()))

@@ -213,8 +213,7 @@ def test_a_page_of_many_points_shows_twelve_each_as_chip_raw_and_registered_scen
 
 
 @pytest.mark.parametrize(
-    "chip",
-    [np.zeros((101, 101), np.uint8), np.full((101, 101), np.nan), np.full((101, 101), np.inf)],
+    "chip", [np.zeros((101, 101), np.uint8), np.full((101, 101), np.nan), np.full((101, 101), np.inf)]
 )
 def test_a_chip_without_data_is_still_an_image(chip):
     assert chip_uri(chip).startswith("data:image/png;base64,")

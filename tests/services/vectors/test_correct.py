@@ -224,10 +224,7 @@ def test_the_stated_precision_is_honest() -> None:
         for errors, moved in ((relative, seen), (on_the_earth, seen + shift)):
             wrong = intersect_terrain(model, moved, raised)
             errors.append((wrong - met)[:, :2] * metres_per_degree_at(met))
-    for errors, covariance in (
-        (relative, stated.relative_m2),
-        (on_the_earth, stated.on_the_earth_m2),
-    ):
+    for errors, covariance in ((relative, stated.relative_m2), (on_the_earth, stated.on_the_earth_m2)):
         error = np.concatenate(errors)
         found = normalised_error(error, np.tile(covariance, (draws, 1, 1)))
         assert 0.85 < found.mean_square < 1.15
