@@ -50,6 +50,7 @@ from tests.services.adjustment import test_bent_blocks as bent
 from tests.services.adjustment import test_frame_fit as framed
 from tests.services.adjustment import test_intersected_marks as marked
 from tests.services.adjustment import test_known_images as neighbours
+from tests.services.adjustment import test_one_image as one_image
 from tests.services.adjustment import test_rigorous_block as rigorous
 from tests.services.conftest import GSD_M, SHAPE, FlatModel, register
 from tests.services.misfit import test_adjust_scene as affine
@@ -93,6 +94,13 @@ def _block_of_orbits() -> Any:
     adjusted = adjust_block(images, truth.observed(rng, 0.2), control=control)
     figures = parameter_figures(images, adjusted)
     return adjusted, figures, held_parameters(figures), [image.credible_px for image in images]
+
+
+def _one_image() -> Any:
+    """On one point, which leaves it to turn about the line of sight, and on three."""
+    (view,), places = ring_of_geometries(1, shape=(600, 800)), np.array([[90.0, 500.0]])
+    three = np.concatenate([places, [[400.0, 120.0], [310.0, 710.0]]])
+    return [one_image.alone(view, at, own_m=0.1, frame_m=0.2, by_hand=True) for at in (places, three)]
 
 
 def _marks_of_several_images() -> Any:
@@ -145,9 +153,7 @@ def _corrections() -> dict[str, SceneAdjustment]:
     points = affine.with_blunders(affine.seen(affine.TRUTH["affine"], rng, 60), 9, rng)
     first, of_block = affine.blocks_apart(0.8, rng, 50)
     covariance_m2 = np.tile(0.02 * UNEQUAL_M2, (50, 1, 1))
-    plain = affine.ControlObservations(
-        first.lon_lat_h, first.line_sample, first.sigma_px, covariance_m2, chip_side_px=200.0
-    )
+    plain = replace(first, covariance_m2=covariance_m2).observed(chip_side_px=200.0)
     common_px2, deformation_px2 = np.array([[0.9, 0.2], [0.2, 0.5]]), np.array([[0.4, 0.1], [0.1, 0.2]])
     given = {
         "blocks": replace(plain, block=of_block),
@@ -357,6 +363,7 @@ WORLDS: dict[str, Callable[[], Any]] = {
     "block beside a neighbour": _block_beside_a_neighbour,
     "block of ortho-images": _block_of_ortho_images,
     "block of orbits": _block_of_orbits,
+    "one image": _one_image,
     "block that bends": lambda: bent.bent_block(3)[0],
     "marks of several images": _marks_of_several_images,
     "noise of observations": _noise_of_observations,

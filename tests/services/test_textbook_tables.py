@@ -67,6 +67,8 @@ def test_order_statistics_bound_a_quantile_as_the_binomial_table_says(
     found = sample_quantile(np.random.default_rng(1).permutation(count) + 1.0)
     assert found.lower == pytest.approx(lower)
     assert np.isnan(found.upper) if upper is None else found.upper == pytest.approx(upper)
+    assert (f"{count} points; 30 are needed" in found.note) == (count < 30)
+    assert ("do not bound" in found.note) == (upper is None)
 
 
 def test_the_standard_deviation_of_a_sample_divides_by_one_less_and_its_rms_does_not() -> None:

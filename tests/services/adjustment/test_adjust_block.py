@@ -195,14 +195,6 @@ def test_a_few_large_residuals_do_not_make_the_precision_of_all(five: list[ViewG
     assert adjusted(five, longer).sigma_px < 1.15 * clean.sigma_px
 
 
-def test_without_blunders_points_are_exactly_as_good_as_they_say(five: list[ViewGeometry]) -> None:
-    trial = tried(five, 100, blunders=0.0)
-    error_m, covariance = point_errors(trial)
-    assert whitened_square(error_m, covariance).mean() == pytest.approx(1.0, abs=0.15)
-    assert trial.block.sigma_px == pytest.approx(1.0, abs=0.08)
-    assert trial.block.active.mean() > 0.99
-
-
 @pytest.mark.parametrize("noise_px", [0.05, 0.2, 0.9])
 def test_the_scale_of_the_residuals_is_the_noise(five: list[ViewGeometry], noise_px: float) -> None:
     trial = tried(five, 101, noise_px=noise_px)

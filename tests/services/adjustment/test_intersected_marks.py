@@ -1,11 +1,17 @@
 """Points from marks in images whose models are off: truth within the stated covariance."""
 
 from dataclasses import replace
+from statistics import NormalDist
 
 import numpy as np
 import pytest
 
-from amers.services.adjustment.intersected_marks import EXACT_MODEL, ModelErrors, intersect_marks
+from amers.services.adjustment.intersected_marks import (
+    EXACT_MODEL,
+    IntersectedMarks,
+    ModelErrors,
+    intersect_marks,
+)
 from amers.services.types import Array, Observations
 from tests.services.simulated import ring_of_geometries
 from tests.services.ties import Ties, difference_m, make_ties, whitened_square
@@ -96,6 +102,28 @@ def test_of_two_marks_that_disagree_neither_is_named() -> None:
     found = intersect_marks(models, [OFF] * 2, marks, 30)
     assert not found.rejected.any()
     assert np.flatnonzero(found.disagree).tolist() == [5]
+
+
+@pytest.mark.parametrize("images", [2, 3])
+@pytest.mark.parametrize("beyond", [0.98, 1.02])
+def test_a_mark_is_wrong_beyond_what_chance_gives_one_file_in_a_thousand(
+    images: int, beyond: float
+) -> None:
+    """A pair has one free number, of the normal law; a mark beside two others has two, of Rayleigh's."""
+    rng, one = np.random.default_rng(9), [EXACT_MODEL] * images
+    geometries = ring_of_geometries(images)
+    models, ties = [view.rpc for view in geometries], make_ties(geometries, rng, 30, 0.0).observations
+    exact, chance = replace(ties, sigma_px=np.full(len(ties), NOISE_PX)), 1e-3 / len(ties)
+    largest = NormalDist().inv_cdf(1.0 - chance / 2.0) if images == 2 else np.sqrt(-2.0 * np.log(chance))
+
+    def found(off_px: float) -> IntersectedMarks:
+        moved_px = np.where(np.arange(len(exact)) == 10, off_px, 0.0)[:, None]
+        return intersect_marks(models, one, replace(exact, line_sample=exact.line_sample + moved_px), 30)
+
+    off_px = 0.1 * beyond * largest / np.sqrt(found(0.1).test[10])
+    told = found(off_px)
+    assert told.disagree.any() == (images == 2 and beyond > 1.0)
+    assert told.rejected.any() == (images == 3 and beyond > 1.0)
 
 
 def test_where_two_of_three_marks_may_be_wrong_both_are_named() -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,13 +39,15 @@ class Seen:
     covariance_m2: Array
     truth: ImageCorrection
 
+    def observed(self, **more: Any) -> ControlObservations:
+        return ControlObservations(
+            self.lon_lat_h, self.line_sample, self.sigma_px, self.covariance_m2, **more
+        )
+
     def adjust(
         self, options: AdjustmentOptions = DEFAULTS, usable: BoolArray | None = None
     ) -> SceneAdjustment:
-        observations = ControlObservations(
-            self.lon_lat_h, self.line_sample, self.sigma_px, self.covariance_m2, usable
-        )
-        return adjust_scene(FlatModel(), SHAPE, observations, options)
+        return adjust_scene(FlatModel(), SHAPE, self.observed(usable=usable), options)
 
 
 def seen(parameters: Array, rng: np.random.Generator, n: int = 40, noise_px: float = NOISE_PX) -> Seen:
@@ -459,9 +462,7 @@ def test_a_repetition_expects_drifts_as_large_as_the_whole_does() -> None:
     """Points in the middle tell little of drift and skew: the corners are as uncertain as expected."""
     points = seen(TRUTH["shift"], np.random.default_rng(25), 60)
     middle = (np.abs(points.line_sample / np.array(SHAPE) - 0.5) < 0.2).all(axis=1)
-    observations = ControlObservations(
-        points.lon_lat_h, points.line_sample, points.sigma_px, points.covariance_m2, middle
-    )
+    observations = points.observed(usable=middle)
     alone = adjust_scene(FlatModel(), SHAPE, observations)
     corner = np.zeros((1, 2))
 
@@ -494,14 +495,7 @@ def blocks_apart(apart_px: float, rng: np.random.Generator, n: int = 100) -> tup
 
 
 def corner_std_px(points: Seen, block: np.ndarray | None, frame_m2: Array | None = None) -> float:
-    observations = ControlObservations(
-        points.lon_lat_h,
-        points.line_sample,
-        points.sigma_px,
-        points.covariance_m2,
-        block=block,
-        frame_covariance_m2=frame_m2,
-    )
+    observations = points.observed(block=block, frame_covariance_m2=frame_m2)
     result = adjust_scene(FlatModel(), SHAPE, observations)
     corner = np.array([1.0, -1.0, -1.0, 0.0, 0.0, 0.0])
     return float(np.sqrt(corner @ result.covariance @ corner))
@@ -566,9 +560,7 @@ def test_blocks_that_agree_cost_little_whatever_their_frames_state() -> None:
 
 def test_points_of_a_second_block_do_not_look_wrong() -> None:
     points, block = blocks_apart(4.0, np.random.default_rng(21))
-    observations = ControlObservations(
-        points.lon_lat_h, points.line_sample, points.sigma_px, points.covariance_m2, block=block
-    )
+    observations = points.observed(block=block)
     assert adjust_scene(FlatModel(), SHAPE, observations).active.mean() > 0.9
 
 
@@ -586,9 +578,7 @@ def test_chips_that_overlap_do_not_count_twice() -> None:
     )
 
     def variance(of: Seen, side_px: float) -> float:
-        observations = ControlObservations(
-            of.lon_lat_h, of.line_sample, of.sigma_px, of.covariance_m2, chip_side_px=side_px
-        )
+        observations = of.observed(chip_side_px=side_px)
         shift_only = AdjustmentOptions(order="shift")
         return float(adjust_scene(FlatModel(), SHAPE, observations, shift_only).covariance[0, 0])
 
@@ -623,9 +613,7 @@ def test_a_deformation_of_the_points_is_in_the_accuracy_however_far_off_the_mode
 ) -> None:
     parameters = np.array([[shift_px, 0.5, 0.0], [-shift_px, 0.0, 0.5]])
     points = seen(parameters, np.random.default_rng(9))
-    plain = ControlObservations(
-        points.lon_lat_h, points.line_sample, points.sigma_px, points.covariance_m2
-    )
+    plain = points.observed()
     deformation_px2 = np.array([[0.4, 0.1], [0.1, 0.2]])
     deformed = replace(plain, deformation_px2=deformation_px2)
     without, with_it = (

@@ -5,12 +5,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from amers.services.misfit.control_observations import ControlObservations
 from amers.services.misfit.image_correction import adjust_scene
 from amers.services.misfit.scene_adjustment import SceneAdjustment
 from amers.services.quality.accuracy import normalised_error
 from amers.services.quality.normal_law import normal_ce90
 from amers.services.sensors.correction import ImageCorrection
-from amers.services.types import Array, BoolArray
+from amers.services.types import Array, BoolArray, IntArray
 from tests.services.conftest import FlatModel
 from tests.services.misfit.test_displacement_components import (
     MOTIONS,
@@ -69,6 +70,12 @@ def beside(
     return ratio, normalised_error(error, covariance).mean_square
 
 
+def taken(observations: ControlObservations, rows: IntArray) -> ControlObservations:
+    """Some of the observations, or all of them several times."""
+    names = ("lon_lat_h", "line_sample", "sigma_px", "covariance_m2")
+    return replace(observations, **{name: getattr(observations, name)[rows] for name in names})
+
+
 THIRD = landslide(0.3, np.array([2.5, 3.5]), np.array([0.3, -0.2]))
 """Nine times the scatter of the points: a jitter and a bow come near to it."""
 
@@ -105,14 +112,7 @@ def test_the_larger_area_is_the_scene_even_where_the_smaller_has_more_points():
     on_it = THIRD.holds(FlatModel().project(observations.lon_lat_h))
     fewer = np.flatnonzero(~on_it)[: int(0.8 * on_it.sum())]
     kept = np.sort(np.concatenate([np.flatnonzero(on_it), fewer]))
-    observations = replace(
-        observations,
-        lon_lat_h=observations.lon_lat_h[kept],
-        line_sample=observations.line_sample[kept],
-        sigma_px=observations.sigma_px[kept],
-        covariance_m2=observations.covariance_m2[kept],
-    )
-    adjustment = adjust_scene(FlatModel(), SHAPE, observations, ground_may_move=True)
+    adjustment = adjust_scene(FlatModel(), SHAPE, taken(observations, kept), ground_may_move=True)
     assert adjustment.moved is not None
     assert beside(adjustment, truth, THIRD)[0] < WRONG
 
@@ -132,13 +132,7 @@ def test_ground_that_holds_nearly_all_usable_points_stays_the_scene():
 @pytest.mark.long
 def test_chips_that_are_the_same_can_be_compared():
     observations, truth = draw(THIRD, np.random.default_rng(3), wrong=0.0)
-    twice = replace(
-        observations,
-        lon_lat_h=np.repeat(observations.lon_lat_h, 2, axis=0),
-        line_sample=np.repeat(observations.line_sample, 2, axis=0),
-        sigma_px=np.repeat(observations.sigma_px, 2),
-        covariance_m2=np.repeat(observations.covariance_m2, 2, axis=0),
-    )
+    twice = taken(observations, np.repeat(np.arange(len(observations.sigma_px)), 2))
     adjustment = adjust_scene(FlatModel(), SHAPE, twice, ground_may_move=True)
     assert adjustment.moved is not None
     assert beside(adjustment, truth, THIRD)[0] < WRONG

@@ -11,14 +11,6 @@ from amers.services.quality.normal_law import CIRCULAR_CE90, normal_ce90
 a_ten_thousandth = 1e-4
 
 
-@pytest.mark.parametrize(("n", "bounded"), [(28, False), (29, True)])
-def test_the_90_percent_quantile_is_bounded_above_from_29_values_on(n, bounded):
-    quantile = sample_quantile(np.arange(float(n)))
-    assert np.isfinite(quantile.upper) == bounded
-    assert f"{n} points; 30 are needed" in quantile.note
-    assert ("do not bound" in quantile.note) == (not bounded)
-
-
 @pytest.mark.long
 def test_the_interval_holds_the_true_quantile_as_often_as_stated():
     rng = np.random.default_rng(5)

@@ -124,16 +124,17 @@ def test_a_search_of_the_middle_of_a_scene_says_so(report):
     )
 
 
-def test_a_turned_image_is_to_be_turned_and_not_searched_farther(report):
-    (step,) = next_steps(TurnedImage("upside down"), report.scene, (STAGE,), COMMAND)
-    assert step.text.startswith("Turn the image or its model")
-    assert step.command == COMMAND
-
-
-def test_an_image_with_other_pixels_gets_its_own_model(report):
-    (step,) = next_steps(RescaledImage("2 times finer"), report.scene, (STAGE,), COMMAND)
-    assert step.text.startswith("Give the model of this image")
-    assert step.command == f"{COMMAND} --model FILE"
+@pytest.mark.parametrize(
+    ("error", "begin", "more"),
+    [
+        (TurnedImage("upside down"), "Turn the image or its model", ""),
+        (RescaledImage("2 times finer"), "Give the model of this image", " --model FILE"),
+    ],
+)
+def test_an_image_unlike_its_model_is_not_searched_farther(report, error, begin: str, more: str):
+    (step,) = next_steps(error, report.scene, (STAGE,), COMMAND)
+    assert step.text.startswith(begin)
+    assert step.command == COMMAND + more
 
 
 def test_an_image_with_lost_lines_is_to_be_cut_before_it_is_searched_otherwise(report):

@@ -8,10 +8,6 @@ import pytest
 from amers.services.reports.published import published_tables
 
 
-def values(table):
-    return dict(zip(table.columns, table.values, strict=True))
-
-
 def test_a_published_row_comes_out_of_its_own_counts_and_components(material):
     """S7PX--2017021834832683CP: 494 of 526 of 997; P1BPX-2019080641037699CP: -2.9, 1.3, 3.4, 2.0."""
     report = material().report()
@@ -35,16 +31,6 @@ def test_a_published_row_comes_out_of_its_own_counts_and_components(material):
     assert report.scene.gsd_m == 0.5
     published_m = (-2.9, 1.3, 3.2, 3.4, 2.0, 3.9)
     assert image.values == pytest.approx(published_m, abs=0.05)
-
-
-def test_displacements_are_those_of_one_draw_with_their_signs(report):
-    moved = values(published_tables(report)[3])
-    for k, place in enumerate(report.stability.displacements):
-        corner = "0123c"[k]
-        length_m = math.hypot(moved[f"dX{corner}"], moved[f"dY{corner}"])
-        assert 0.0 < length_m <= place.max_m * (1.0 + 1e-12)
-        assert (moved[f"dX{corner}"], moved[f"dY{corner}"]) == (place.x_m, place.y_m)
-    assert moved["Incidence (°)"] == report.scene.acquisition.incidence_deg
 
 
 def test_a_scene_without_draws_has_dashes_and_the_reason(material):
