@@ -114,7 +114,7 @@ def _marks_of_several_images() -> Any:
 
 def _noise_of_observations() -> Any:
     views, rng = ring_of_geometries(3), np.random.default_rng(12)
-    ties = make_ties(views, rng, 200, 0.0, seen=0.8)
+    ties = make_ties(views, rng, 4300, 0.0, seen=0.8)
     ties.observations.sigma_px[:] = sigma_px = rng.choice([0.03, 0.2], len(ties.observations))
     noise_px = rng.normal(0.0, np.hypot(1.4 * sigma_px, 0.1)[:, None], (len(sigma_px), 2))
     noise = found_noise(ties.observations, [view.rpc for view in views], ties.lon_lat_h, noise_px)
@@ -175,6 +175,8 @@ def _corrections() -> dict[str, SceneAdjustment]:
     out["repetition"] = adjust_scene(FlatModel(), moving.SHAPE, repeated, like=out[name])
     lost, rng = broken.broken(2, 40.0)
     out["lost lines"] = adjust_scene(FlatModel(), broken.SHAPE, lost.observed(rng))
+    many, _ = moving.draw(moving.MOTIONS["jitter"], np.random.default_rng(4), count=420)
+    out["more points than are searched"] = adjust_scene(FlatModel(), moving.SHAPE, many)
     half, _ = moving.draw(moving.still, np.random.default_rng(8), reach=(0.5, 0.7))
     out["half of an image"] = adjust_scene(FlatModel(), moving.SHAPE, half)
     return out
@@ -239,9 +241,12 @@ def _marks_in_an_image() -> Any:
     alone = [
         register_on_marks(on_marks.SCENE, one) for one in (wrong, two, on_marks.marks_at(places[:1]))
     ]
-    scene = register(n=40).adjusted()
-    names, sigma_m = tuple(f"P{k}" for k in range(5)), np.tile([0.2, 0.3, 0.6], (5, 1))
-    return [one.marks for one in alone], marks_beside_points(scene, names, sigma_m)
+    scene = register(n=60).adjusted()
+    beside = [
+        marks_beside_points(scene, tuple(f"P{k}" for k in range(n)), np.tile([0.2, 0.3, 0.6], (n, 1)))
+        for n in (5, 51)
+    ]
+    return [one.marks for one in alone], beside[0], beside[1].marks[-8:], beside[1].words
 
 
 @cache
@@ -331,7 +336,9 @@ def _places_that_are_held() -> Any:
     )
     missed = missed_along(points[:, 0], ~((points[:, 0] > 700.0) & (rng.random(300) < 0.97)), ~hole)
     misfit_px = np.where(hole[:, None], [4.0, -7.0], 0.0) + rng.normal(0.0, 0.5, (300, 2))
-    return area, area.percent, area.polygons, missed, agree_elsewhere(points, misfit_px, hole, 2.0)
+    many = missed_along(rng.random(3000), rng.random(3000) < 0.5, np.ones(3000, dtype=bool))
+    beside = agree_elsewhere(points, misfit_px, hole, 2.0)
+    return area, area.percent, area.polygons, missed, many, beside
 
 
 def _lines_of_sight() -> Any:

@@ -52,6 +52,7 @@ def in_parts(monkeypatch: pytest.MonkeyPatch) -> InParts:
         monkeypatch.setattr(dissection, "DIRECT_ROWS", 120)
         monkeypatch.setattr(dissection, "_MOST_SEPARATING", 0.8)
         monkeypatch.setattr(reduced_system, "DENSE_ROWS", 60)
+        monkeypatch.setattr(reduced_system, "_AT_ONCE", 50)
         return sizes
 
     return make
