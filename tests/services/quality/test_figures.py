@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from amers.services.quality.criteria import VERDICT_EXPLANATIONS, at_least, at_most, verdict_of
+from amers.services.quality.criteria import at_least, at_most
 from amers.services.quality.predicted import predict_accuracy
 from amers.services.quality.qualification import unexplained_px
 from amers.services.types import Array, Frame
@@ -141,20 +141,3 @@ def test_a_criterion_is_met_at_its_limit_and_not_beyond(needed_for):
     assert at_most("displacement_px", 2.0, 2.0, needed_for).comparison == "at most"
     for criterion in (at_least, at_most):
         assert not criterion("active_points", np.nan, 2.0, needed_for).met
-
-
-@pytest.mark.parametrize(
-    ("unmet", "verdict"),
-    [
-        ((), "good"),
-        (("good",), "usable"),
-        (("usable",), "failed"),
-        (("good", "usable"), "failed"),
-        (("usable", "good"), "failed"),
-    ],
-)
-def test_the_worst_criterion_decides_whatever_the_order(unmet, verdict):
-    met = [at_most("displacement_px", 1.0, 2.0, grade) for grade in ("good", "usable")]
-    criteria = [*met, *(at_most("displacement_px", 3.0, 2.0, grade) for grade in unmet)]
-    assert verdict_of(tuple(criteria)) == verdict_of(tuple(criteria[::-1])) == verdict
-    assert verdict in VERDICT_EXPLANATIONS

@@ -25,6 +25,8 @@ from amers.services.joint.results import RigorousScene
 from amers.services.map_grid import MapGrid
 from amers.services.production.image_selection import SelectionOptions, select_images
 from amers.services.quality.accuracy_statement import median_accuracy
+from amers.services.quality.finding import Finding
+from amers.services.quality.marks import MarksReport
 from amers.services.registration.options import RegistrationOptions
 from amers.services.reports.base import BaseReport
 from amers.services.reports.base_pages import BASE_PAGE
@@ -33,12 +35,14 @@ from amers.services.reports.block_adjustment_pages import ADJUSTMENT_PAGE, IMAGE
 from amers.services.reports.block_quality_pages import QUALITY_PAGE
 from amers.services.reports.document import report_document
 from amers.services.reports.failure_pages import FAILURE_PAGE
+from amers.services.reports.figure_data import displacement_sections
 from amers.services.reports.html import Page, format_html
 from amers.services.reports.joint import JointReport, joint_report
 from amers.services.reports.joint_pages import JOINT_PAGE
 from amers.services.reports.plan import points_csv as points_of_plan
 from amers.services.reports.plan_pages import PLAN_PAGE
 from amers.services.reports.registration_pages import REGISTRATION_PAGE
+from amers.services.reports.report import Check, RegistrationReport
 from amers.services.reports.selection import SelectionReport, SourceFacts, overlap_csv, selection_report
 from amers.services.reports.selection_pages import SELECTION_PAGE
 from amers.services.reports.surface import DifferenceReport, ReducedMap, SurfaceReport
@@ -49,8 +53,10 @@ from amers.services.types import Frame
 from benchmarks._catalogue import simulate_catalogue
 from tests.app.stand_ins import stand_in
 from tests.services import judged_worlds as judged
+from tests.services.conftest import FlatModel
 from tests.services.figures import Figures, differing, figures
 from tests.services.joint import test_joint_block as joint
+from tests.services.misfit import test_displacement_components as moving
 from tests.services.reports import test_block_reports as blocks
 from tests.services.reports import test_failure as failures
 from tests.services.reports.conftest import material_of
@@ -123,6 +129,20 @@ def _difference() -> DifferenceReport:
     return replace(stand_in(DifferenceReport, "difference"), map=shown, **shifts)
 
 
+def _with_everything() -> RegistrationReport:
+    """With findings, a check of heights, marks, and lines that move."""
+    observed, _ = moving.draw(moving.MOTIONS["jitter"], np.random.default_rng(3))
+    motion, made = moving.adjust_scene(FlatModel(), moving.SHAPE, observed), material_of()
+    drawn = {
+        "displacement": motion.correction.displacement,
+        "sections": displacement_sections(motion),
+    }
+    report = replace(made, figure_data=replace(made.figure_data, **drawn)).report()
+    told = stand_in(tuple[Finding, ...], "findings"), stand_in(tuple[Check, ...], "checks")
+    marks = stand_in(MarksReport, "marks")
+    return replace(report, findings=told[0], checks=(*report.checks, *told[1]), marks=marks)
+
+
 def _together() -> JointReport:
     """Two scenes beside one that was adjusted before, and one that left."""
     rng, made = np.random.default_rng(7), []
@@ -175,6 +195,7 @@ def _base() -> BaseReport:
 PAGES: dict[str, tuple[Page, Callable[[], Any]]] = {
     "registration": (REGISTRATION_PAGE, lambda: material_of().report()),
     "poor registration": (REGISTRATION_PAGE, lambda: material_of(n=200, bend_px=1.5, wrong=9).report()),
+    "registration with everything": (REGISTRATION_PAGE, _with_everything),
     "failure": (FAILURE_PAGE, lambda: failures.failure(material_of().report())),
     "together": (JOINT_PAGE, _together),
     "plan": (PLAN_PAGE, blocks.plan_report),
