@@ -77,9 +77,5 @@ def test_heights_of_bent_blocks_err_as_stated() -> None:
         error_m -= error_m.mean()
         squares.append(float(np.mean(error_m**2 / block.point_covariance_m2[found, 2, 2])))
         bends_m.append(float(np.sqrt(block.point_shared_m2[found, 2, 2].mean())))
-    print(
-        f"{ARCHIVES} blocks: mean square {np.mean(squares):.2f}, of single blocks {min(squares):.2f} to "
-        f"{max(squares):.2f}; shared by neighbours {np.mean(bends_m):.2f} m"
-    )
     assert honest[0] < np.mean(squares) < honest[1]
     assert np.mean(bends_m) > 0.3

@@ -59,7 +59,6 @@ def test_errors_of_models_are_in_the_covariance_of_each_point_and_not_between_th
         joint.append(whitened_square(error_m, found.joint_m2).mean())
         # A point relative to the mean of the others has the errors of its own marks and of theirs.
         apart.append(whitened_square(error_m - error_m.mean(axis=0), found.marks_m2 * 19 / 20).mean())
-    print(f"{images} images: {np.mean(joint):.2f} on the Earth, {np.mean(apart):.2f} between points")
     assert 0.7 < np.mean(joint) < 1.5
     assert 0.9 < np.mean(apart) < 1.1
 

@@ -120,7 +120,6 @@ def test_the_frame_of_a_neighbour_carries_over_and_covers_the_truth(layout) -> N
         sigma = [np.sqrt(np.diagonal(of.frames[0].covariance_m2)) for of in (block, free)]
         ratios.append(sigma[0] / np.sqrt(np.diagonal(first(layout, trial).frames[0].covariance_m2)))
         assert sigma[0][2] < 0.25 * sigma[1][2], "the height of the frame is that of the neighbour"
-    print(f"{layout}: on the Earth {np.mean(on_earth):.2f}, frame {np.mean(of_frame):.2f}")
     assert np.max(ratios) < 1.1
     assert 0.4 < np.mean(of_frame) < 1.8
     assert 0.5 < np.mean(on_earth) < 1.6
@@ -146,9 +145,6 @@ def test_both_blocks_agree_along_the_seam_as_they_declare(layout) -> None:
         steps.append(np.sqrt(np.mean(step_m(layout, trial, tied=True) ** 2, axis=0)))
         free_steps.append(np.sqrt(np.mean(step_m(layout, trial, tied=False) ** 2, axis=0)))
     step, free_step = np.mean(steps, axis=0), np.mean(free_steps, axis=0)
-    print(
-        f"{layout}: change {np.mean(changes):.2f}; step {step.round(2)} m, else {free_step.round(2)} m"
-    )
     assert 0.5 < np.mean(changes) < 1.6
     assert step[2] < 0.4 * free_step[2]
 

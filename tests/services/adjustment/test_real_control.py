@@ -112,10 +112,6 @@ def test_the_frame_of_another_pair_follows_its_control(triplet: Triplet, base: B
         block = adjust_block(images, observations, control=known)
         error_m = frame_error_m(block, base, known.point)
         covariance = block.frames[0].covariance_m2
-        print(
-            f"injected {injected_m.round(2)}, found {error_m.round(2)}, "
-            f"sigmas {np.sqrt(np.diagonal(covariance)).round(2)}"
-        )
         assert known.point.size == block.control_active.sum()
         assert np.linalg.norm(error_m - injected_m) < 3.0 * point_sigma_m
         assert block.frames[0].sigma_m < 1.2 * FRAME.sigma_m

@@ -115,9 +115,6 @@ def test_points_are_as_precise_as_predicted_in_their_frame(drawn, control: bool)
     found_m = np.sqrt(np.nanmean(error_m**2, axis=0))
     predicted_m = np.sqrt(np.nanmean(np.diagonal(covariance_m2, 0, 1, 2), axis=0))
     square = normalised_error(error_m, covariance_m2).mean_square
-    print(
-        f"control {control}: {found_m.round(3)} m, predicted {predicted_m.round(3)}, square {square:.2f}"
-    )
     assert np.isfinite(error_m).all(axis=1).mean() > 0.9
     np.testing.assert_allclose(found_m, predicted_m, rtol=0.25)
     assert 0.7 < square < 1.3
@@ -131,8 +128,6 @@ def test_errors_on_the_earth_are_those_declared(drawn, control: bool) -> None:
         error_m = np.nanmedian(block.errors_m(), axis=0)
         covariance_m2 = block.found.frames[0].covariance_m2
         frame.append(error_m @ np.linalg.solve(covariance_m2, error_m) / 3.0)
-    sigma_m = np.sqrt(np.diag(covariance_m2))
-    print(f"control {control}: frame {sigma_m.round(2)} m, mean square {np.mean(frame):.2f}")
     assert 0.3 < np.mean(frame) < 2.0
 
 

@@ -73,10 +73,5 @@ def median_px(block: BlockAdjustment, observations: Observations) -> float:
 def test_rays_of_real_tie_points_meet(real_data: Path, folder: str, largest_px: float) -> None:
     block, observations = adjusted(real_data / "skysat_tiepoints" / folder)
     found_px = median_px(block, observations)
-    print(
-        f"{folder}: {found_px:.3f} px, scale {block.sigma_px:.2f}, {block.active.mean():.1%} of "
-        f"{len(observations)} observations, {block.iterations} iterations, "
-        f"drifts {block.slope_factor:.2f} times as large as stated"
-    )
     assert found_px <= largest_px
     assert 0.5 < block.active.mean() < 1.0

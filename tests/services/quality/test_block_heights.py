@@ -179,7 +179,6 @@ def test_intervals_of_errors_that_groups_share_hold_the_truth():
         held += interval.lower <= true and not interval.upper < true
         independent = sample_quantile(distance)
         plain += independent.lower <= true <= independent.upper
-    print(f"{held} of 300 with the groups, {plain} without")
     assert held >= 0.85 * 300
     assert plain < 0.6 * 300
 

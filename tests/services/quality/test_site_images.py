@@ -110,7 +110,6 @@ def test_points_of_inclined_views_lie_as_far_off_as_they_truly_do() -> None:
     assert len(errors.error_m) >= 0.95 * errors.tried
     quality = planimetric_quality([errors], "points", points.frames[0])
     shift_m = np.array([quality.shift_east_m, quality.shift_north_m])
-    print(f"true {np.median(true_m, axis=0)}, found {shift_m}, {quality.relative.ce90_m.value:.2f} m")
     assert_allclose(shift_m, np.median(true_m, axis=0), atol=2 * a_tenth_of_a_pixel_m)
     assert quality.relative.ce90_m.value < quality.declared_ce90_m
     assert quality.normalised_frame.mean_square < quality.normalised_frame.upper

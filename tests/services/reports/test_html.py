@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from amers.services.quality.criteria import Criterion
-from amers.services.registration.options import RegistrationOptions
 from amers.services.reports.charts import funnel
 from amers.services.reports.criteria_rows import margin_words
 from amers.services.reports.drawing import ACTIVE, ARROW, round_number
@@ -20,7 +19,6 @@ from amers.services.reports.html import figure_markup, format_html
 from amers.services.reports.maps import coverage_map, residual_map
 from amers.services.reports.plot import tick_words, ticks
 from amers.services.reports.registration_pages import FIGURES, REGISTRATION_PAGE
-from amers.services.reports.scene_words import flat_options
 from amers.services.types import Acquisition
 
 HOSTILE = "<script>alert('x')</script>\"&$\\frac"
@@ -277,12 +275,6 @@ def test_a_margin_is_positive_where_the_criterion_is_met(value, comparison, limi
         calculation="",
     )
     assert margin_words(criterion) == words
-
-
-def test_options_inside_options_are_listed_by_dotted_names():
-    listed = dict(flat_options(RegistrationOptions(max_points=80)))
-    assert listed["max_points"] == "80"
-    assert listed["qualification.good_active_points"] == "20"
 
 
 @pytest.mark.parametrize(
