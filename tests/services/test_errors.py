@@ -2,7 +2,16 @@
 
 import pytest
 
-from amers.services.errors import causes, causes_and_contexts
+from amers.services.errors import (
+    FormatError,
+    InputError,
+    MissingStatements,
+    NotEnoughPoints,
+    causes,
+    causes_and_contexts,
+    refuse_unstated,
+    reword,
+)
 
 
 def linked(*names: str) -> dict[str, Exception]:
@@ -65,3 +74,23 @@ def test_what_was_only_being_handled_is_no_cause():
     errors["error"].__context__, errors["error"].__cause__ = errors["handled"], errors["cause"]
     errors["cause"].__cause__ = errors["error"]
     assert [str(one) for one in causes(errors["error"])] == ["error", "cause"]
+
+
+def test_all_that_is_not_stated_is_refused_together_and_one_by_itself():
+    refuse_unstated([])
+    alone, both = FormatError("no unit"), MissingStatements(["no datum", "no epoch"])
+    with pytest.raises(FormatError, match=r"^no unit$"):
+        refuse_unstated([alone])
+    with pytest.raises(MissingStatements) as caught:
+        refuse_unstated([both, alone])
+    assert caught.value.missing == ("no datum", "no epoch", "no unit")
+    reword(caught.value, str.upper)
+    assert caught.value.missing == ("NO DATUM", "NO EPOCH", "NO UNIT")
+    assert str(caught.value) == "3 STATEMENTS ARE MISSING: (1) NO DATUM; (2) NO EPOCH; (3) NO UNIT"
+    one: InputError = MissingStatements(["no datum"])
+    assert str(one) == "no datum"
+
+
+def test_too_few_points_are_refused_with_their_numbers():
+    assert str(NotEnoughPoints(3, 6)) == "3 usable points found, 6 needed"
+    assert str(NotEnoughPoints(3, 6, "of ties")) == "3 usable points found, 6 needed: of ties"

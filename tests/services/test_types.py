@@ -1,6 +1,7 @@
 """Selected points and observations are the requested rows, in the requested order."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,6 +14,7 @@ from amers.services.types import (
     Observations,
     Views,
     health,
+    part_of,
 )
 
 OF_POINTS = ("id", "lon_lat_h", "covariance_m2", "block", "saliency", "health", "chip_file", "chip_row")
@@ -69,6 +71,12 @@ def test_selected_points_keep_all_their_attributes(counts: list[int], data: st.D
             np.testing.assert_array_equal(
                 getattr(taken.views, name)[mine], getattr(points.views, name)[theirs]
             )
+
+
+def test_a_part_of_some_work_moves_its_own_share_of_the_progress() -> None:
+    told: list[tuple[float, str]] = []
+    part_of(part_of(lambda *done: told.append(done), 0.2, 0.5), 0.5, 0.25)(0.4, "half")
+    assert told == [(pytest.approx(0.2 + 0.5 * (0.5 + 0.25 * 0.4)), "half")]
 
 
 def test_health_is_one_without_a_history_and_falls_with_each_failure() -> None:

@@ -5,14 +5,11 @@ import pyproj
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from amers.services.formats.block.document import rectangle
 from amers.services.quality.density import box_area_km2, density_cells, share_reaching
 
 a_square_metre_km2 = 1e-6
 a_thousandth = 1e-3
-
-
-def rectangle(west: float, south: float, east: float, north: float) -> np.ndarray:
-    return np.array([[west, south], [east, south], [east, north], [west, north]])
 
 
 @pytest.mark.parametrize("lat", [-89.9, -45.0, -0.05, 0.0, 43.2, 80.0])

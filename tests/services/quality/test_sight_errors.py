@@ -107,6 +107,23 @@ def test_hills_too_low_to_be_seen_in_the_residuals_refute_nothing() -> None:
     assert told(seen_otherwise(plane_m, 6.0), at, low_m) is not None
 
 
+@pytest.mark.parametrize(("sigmas", "is_told"), [(1.9, False), (2.1, True)])
+def test_a_growth_up_a_slope_is_told_where_it_exceeds_drift_by_two_standard_deviations(
+    sigmas: float, is_told: bool
+) -> None:
+    """Errors that an affine does not follow leave the growth as it was put in."""
+    rng, up = np.random.default_rng(11), np.array([0.8, 0.6])
+    at = places(rng)
+    design = np.column_stack([np.ones(len(at)), at])
+    error_px = rng.normal(0.0, 0.2, (len(at), 2))
+    error_px -= design @ np.linalg.lstsq(design, error_px, rcond=None)[0]
+    of_gradient = np.linalg.inv(design.T @ design)[1:, 1:]
+    sigma = np.sqrt((error_px**2).sum() / (len(at) - 3) * (up @ of_gradient @ up))
+    growth = (0.006 + sigmas * sigma) * np.outer(at @ up, [0.6, -0.8])
+    found = slope_of_growth(error_px + growth, at, 0.05 * at @ up, GSD_M)
+    assert (found is not None) == is_told
+
+
 def test_level_ground_explains_no_correction() -> None:
     """Its points differ by centimetres: no line of sight leans by as much as they would ask for."""
     rng = np.random.default_rng(3)

@@ -133,10 +133,7 @@ def _with_everything() -> RegistrationReport:
     """With findings, a check of heights, marks, and lines that move."""
     observed, _ = moving.draw(moving.MOTIONS["jitter"], np.random.default_rng(3))
     motion, made = moving.adjust_scene(FlatModel(), moving.SHAPE, observed), material_of()
-    drawn = {
-        "displacement": motion.correction.displacement,
-        "sections": displacement_sections(motion),
-    }
+    drawn = {"displacement": motion.correction.displacement, "sections": displacement_sections(motion)}
     report = replace(made, figure_data=replace(made.figure_data, **drawn)).report()
     told = stand_in(tuple[Finding, ...], "findings"), stand_in(tuple[Check, ...], "checks")
     marks = stand_in(MarksReport, "marks")

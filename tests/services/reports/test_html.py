@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from amers.services.quality.criteria import Criterion
+from amers.services.quality.criteria import at_least, at_most
 from amers.services.reports.charts import funnel
 from amers.services.reports.criteria_rows import margin_words
 from amers.services.reports.drawing import ACTIVE, ARROW, round_number
@@ -262,19 +262,8 @@ def test_saturated_pixels_of_a_quicklook_are_as_bright_as_the_brightest(material
     ],
 )
 def test_a_margin_is_positive_where_the_criterion_is_met(value, comparison, limit, words):
-    criterion = Criterion(
-        name="x",
-        label="X",
-        value=value,
-        comparison=comparison,
-        limit=limit,
-        unit="",
-        decimals=2,
-        needed_for="good",
-        met=True,
-        calculation="",
-    )
-    assert margin_words(criterion) == words
+    judged = {"at least": at_least, "at most": at_most}[comparison]
+    assert margin_words(judged("active_points", value, limit, "good")) == words
 
 
 @pytest.mark.parametrize(

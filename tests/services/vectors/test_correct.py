@@ -27,9 +27,11 @@ the_tolerance_px = 0.2
 NOTHING_KNOWN = ErrorSources(None, np.nan, 0.0)
 
 
-def corrected(geometries: Geometries, ground: Terrain, tolerance_px: float = 0.2) -> CorrectedVectors:
+def corrected(
+    geometries: Geometries, ground: Terrain, tolerance_px: float = the_tolerance_px, crs: str = CRS
+) -> CorrectedVectors:
     return correct_vectors(
-        shapes_of(geometries), scene(), ground, CRS, sources=NOTHING_KNOWN, tolerance_px=tolerance_px
+        shapes_of(geometries), scene(), ground, crs, sources=NOTHING_KNOWN, tolerance_px=tolerance_px
     )
 
 
@@ -85,9 +87,7 @@ def test_hidden_ground_is_behind_ground_the_line_of_sight_meets_before() -> None
 @pytest.mark.parametrize("crs", [CRS, "EPSG:4326"])
 def test_edges_follow_the_ground_within_the_tolerance(crs: str) -> None:
     ground, lines = terrain(), long_lines()
-    result = correct_vectors(
-        shapes_of(lines), scene(), ground, crs, sources=NOTHING_KNOWN, tolerance_px=the_tolerance_px
-    )
+    result = corrected(lines, ground, crs=crs)
     assert not result.missed.any()
     straight = corrected(lines, ground, tolerance_px=1e6)
     assert straight.added == 0
@@ -179,9 +179,7 @@ def test_heights_are_in_the_datum_of_the_terrain() -> None:
     over = replace(terrain(), geoid=lambda lon_lat: 40.0 + lon_lat[:, 0])
     points = shapely.points(image_places(20))
     for crs in ("EPSG:32631", "EPSG:4979"):
-        result = correct_vectors(
-            shapes_of(points), scene(), over, crs, sources=NOTHING_KNOWN, tolerance_px=0.2
-        )
+        result = corrected(points, over, crs=crs)
         expected_m = intersect_terrain(scene().model, result.line_sample, over)
         if crs == "EPSG:32631":
             expected_m[:, 2] -= 40.0 + expected_m[:, 0]
