@@ -328,12 +328,6 @@ def test_the_observations_that_leave_are_the_wrong_ones(trials: list[Trial]) -> 
     assert (~active[~touched]).mean() < 0.002
 
 
-def test_active_observations_hold_their_points_with_two_rays_at_least(trials: list[Trial]) -> None:
-    for trial in trials[:10]:
-        rays = np.bincount(trial.ties.observations.point[trial.block.active])
-        assert set(rays[rays > 0]).isdisjoint({1})
-
-
 def test_a_pair_meets_across_its_rays_and_keeps_its_parallax_as_the_priors_say() -> None:
     pair = ring_of_geometries(2)
     rng = np.random.default_rng(3)
