@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import f as f_law
 
+from amers.services.misfit.control_observations import ControlObservations, declared_fit
+from amers.services.misfit.placed_measures import PlacedMeasures
 from amers.services.misfit.structure import Family, Residuals, probability_of_structure, structures
 from amers.services.types import Array
+from tests.services.quality.test_figures import ObliqueModel
 
 SHAPE = (4000.0, 3000.0)
 COUNT = 45
@@ -167,3 +170,22 @@ def test_errors_of_heights_explain_no_more_than_points_can_be_worse_than_declare
     found = structures(replace(told, height_pull=covariance, misfit=misfit), ("height",))[0]
     assert (0.5 * 30.0 * np.abs(slope) < np.abs(found.slope_px)).all()
     assert (np.abs(found.slope_px) < 25.0 * np.abs(slope)).all()
+
+
+def test_errors_of_heights_go_with_displacements_as_the_covariances_of_points_state() -> None:
+    """Of points that all state one covariance, in a view that each of its axes displaces otherwise."""
+    rng, model = np.random.default_rng(80), ObliqueModel()
+    root = rng.normal(size=(3, 3))
+    error_m = rng.normal(size=(200_000, 3)) @ root.T
+    shown_px = error_m @ np.array(model.per_metre).T
+    place, stated_m2 = rng.random((9, 2)) * SHAPE, np.tile(root @ root.T, (9, 1, 1))
+    observations = ControlObservations(
+        model.locate(place, np.zeros(9)), place, np.full(9, 0.5), stated_m2
+    )
+    shape = int(SHAPE[0]), int(SHAPE[1])
+    fit, _, of_points = declared_fit(model, shape, observations)
+    measured = PlacedMeasures.of(model, shape, observations, fit=fit, of_points=of_points)
+    pull = (shown_px * error_m[:, 2:]).mean(axis=0)
+    np.testing.assert_allclose(measured.height_pull, pull, atol=0.02 * np.abs(pull).max())
+    np.testing.assert_allclose(of_points[0], shown_px.var(axis=0), rtol=0.02)
+    assert measured.points_px2 == pytest.approx(shown_px.var(axis=0).max(), rel=0.02)

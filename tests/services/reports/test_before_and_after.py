@@ -51,9 +51,3 @@ def test_the_raw_scene_is_displaced_by_the_error_of_the_delivered_model() -> Non
 def test_the_registered_scene_shows_the_chip_in_its_place() -> None:
     off_px = np.array([displacement_px(one.chip, one.registered) for one in active()])
     assert np.hypot(*np.median(off_px, axis=0)) < half_a_pixel
-
-
-def test_every_compared_point_has_three_images_of_the_size_of_a_chip() -> None:
-    for one in drawn().gallery:
-        shapes = {image.shape for image in (one.chip, one.raw, one.registered)}
-        assert shapes == {one.chip.shape}

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from amers.services.quality.criteria import at_least, at_most
-from amers.services.reports.charts import funnel
 from amers.services.reports.criteria_rows import margin_words
 from amers.services.reports.drawing import ACTIVE, ARROW, round_number
 from amers.services.reports.figure_data import Quicklook
@@ -153,16 +152,6 @@ def test_the_residual_arrows_point_where_the_residuals_do(material):
     assert len(shafts) == made.measures.active.sum()
     assert (down > 0).all()
     np.testing.assert_allclose(right, 2.0 * down, atol=a_printed_digit)
-
-
-def test_what_a_figure_draws_of_hostile_labels_is_text(material):
-    made = material()
-    reason = np.where(made.measures.active, "", HOSTILE)
-    report = made.with_measures(replace(made.measures, reason=reason)).report()
-    for draw in (funnel, coverage_map):
-        parsed = Page(figure_markup(draw, report))
-        assert parsed.tags <= {"svg", "path", "rect", "text", "title", "image"}
-        assert any("<script>" in text for text in parsed.texts)
 
 
 @pytest.mark.parametrize(
