@@ -203,9 +203,7 @@ def test_the_scale_of_the_residuals_is_the_noise(five: list[ViewGeometry], noise
     assert block.sigma_px * NOISE_PX == pytest.approx(noise_px, rel=0.15)
 
 
-def test_points_are_as_good_as_they_say_whatever_the_observations_state(
-    five: list[ViewGeometry],
-) -> None:
+def test_points_are_as_good_as_they_say_whatever_observations_state(five: list[ViewGeometry]) -> None:
     """Sigmas that are all too small by the same factor are made good; the points and theirs stay."""
     ties = make_ties(five, np.random.default_rng(7), 300, 3.0 * NOISE_PX)
     true, small = (

@@ -239,9 +239,7 @@ def test_other_processes_make_the_same_block_bit_for_bit(block: Any, in_parts: I
         same_bits(adjust_block(images, observations, passes=passes, work=work), whole)
 
 
-def test_every_observation_is_in_one_part_of_no_more_than_its_share(
-    block: Any, in_parts: InParts
-) -> None:
+def test_every_observation_is_in_one_part_of_at_most_its_share(block: Any, in_parts: InParts) -> None:
     _, images, observations, _ = block
     in_parts()
     problem = BlockProblem(

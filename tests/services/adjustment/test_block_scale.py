@@ -70,9 +70,7 @@ def residuals_of_rays(rng: np.random.Generator, rays: int, points: int, wrong: f
 
 
 @pytest.mark.parametrize(("rays", "tolerance"), [(3, 0.25), (6, 0.12)])
-def test_both_first_scales_are_that_of_the_noise_where_nothing_is_wrong(
-    rays: int, tolerance: float
-) -> None:
+def test_both_first_scales_are_that_of_noise_where_nothing_is_wrong(rays: int, tolerance: float) -> None:
     """Three rays share their six values unevenly, of which three are left."""
     rng = np.random.default_rng([6, rays])
     point, coordinates = np.repeat(np.arange(600), rays), np.full(600, 3.0)

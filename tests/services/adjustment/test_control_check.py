@@ -131,9 +131,7 @@ def test_a_known_point_leaves_and_comes_back_where_the_others_predict_it(
         assert moved.judged(ALL_BUT_THE_FIRST).tolist() == expected.tolist()
 
 
-def test_a_wrong_point_leaves_alone_although_it_draws_the_block_away_from_the_others(
-    block: Block,
-) -> None:
+def test_a_wrong_point_leaves_alone_although_it_draws_the_block_from_the_others(block: Block) -> None:
     moved = block.moved(np.array([15.0, 0.0, 0.0]))
     assert moved.judged(ALL).tolist() == ALL_BUT_THE_FIRST.tolist()
 

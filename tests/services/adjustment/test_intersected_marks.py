@@ -105,9 +105,7 @@ def test_of_two_marks_that_disagree_neither_is_named() -> None:
 
 @pytest.mark.parametrize("images", [2, 3])
 @pytest.mark.parametrize("beyond", [0.98, 1.02])
-def test_a_mark_is_wrong_beyond_what_chance_gives_one_file_in_a_thousand(
-    images: int, beyond: float
-) -> None:
+def test_a_mark_is_wrong_beyond_the_chance_of_a_file_in_a_thousand(images: int, beyond: float) -> None:
     """A pair has one free number, of the normal law; a mark beside two others has two, of Rayleigh's."""
     rng, one = np.random.default_rng(9), [EXACT_MODEL] * images
     geometries = ring_of_geometries(images)

@@ -53,9 +53,7 @@ def test_errors_are_what_the_covariance_says(count: int) -> None:
     assert (np.abs(error_m.mean(axis=0)) < 4.0 * standard_error).all()
 
 
-def test_the_covariance_of_a_point_of_three_rays_is_that_of_many_trials(
-    three: list[ViewGeometry],
-) -> None:
+def test_the_covariance_of_a_point_of_three_rays_is_that_of_trials(three: list[ViewGeometry]) -> None:
     rng = np.random.default_rng(2)
     one = make_ties(three, rng, 1, 0.0)
     trials = 4000

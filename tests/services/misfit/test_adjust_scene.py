@@ -208,6 +208,16 @@ def test_sigmas_that_were_too_large_are_not_made_smaller() -> None:
     )
 
 
+def test_a_mark_within_what_it_states_stays_beside_points_that_are_better_than_they_state() -> None:
+    """It is off by two of its standard deviations, which are eight of what points scatter by."""
+    points, first = seen(TRUTH["shift"], np.random.default_rng(30), 60), np.arange(60) == 0
+    off = replace(points, line_sample=points.line_sample + first[:, None] * [0.0, 8.0 * NOISE_PX])
+    for is_mark in (True, False):
+        wide = replace(off, sigma_px=4.0 * off.sigma_px).observed(stated=first & is_mark)
+        result = adjust_scene(FlatModel(), SHAPE, wide, AdjustmentOptions(order="shift"))
+        assert result.active[0] == is_mark
+
+
 @pytest.mark.parametrize("tolerance", [1.5, 2.7])
 def test_honest_sigmas_have_unit_weight_whatever_the_tolerance(tolerance: float) -> None:
     """A tolerance keeps the smaller residuals: within 1.5 sigma, they have 0.74 of their sigma."""
@@ -601,9 +611,7 @@ def test_measures_of_which_little_is_their_own_share_as_little_with_others() -> 
 
 
 @pytest.mark.parametrize("shift_px", [0.0, 12_000.0])
-def test_a_deformation_of_the_points_is_in_the_accuracy_however_far_off_the_model_is(
-    shift_px: float,
-) -> None:
+def test_a_deformation_of_points_is_in_the_accuracy_however_far_off_models_are(shift_px: float) -> None:
     parameters = np.array([[shift_px, 0.5, 0.0], [-shift_px, 0.0, 0.5]])
     points = seen(parameters, np.random.default_rng(9))
     plain = points.observed()

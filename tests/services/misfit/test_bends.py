@@ -187,9 +187,7 @@ def test_bends_are_the_same_however_far_the_model_is_off() -> None:
 
 
 @pytest.mark.parametrize(("size_px", "sigma_px"), [(0.0, 0.3), (1.0, 0.3), (4.0, 0.8)])
-def test_what_is_left_of_a_bend_is_its_mean_square_bent_or_straight(
-    size_px: float, sigma_px: float
-) -> None:
+def test_what_is_left_of_a_bend_is_its_mean_square_bent_or_not(size_px: float, sigma_px: float) -> None:
     """A bend is as likely absent as normal of 1 px, or of what exceeds three sigmas of its estimate."""
     rng = np.random.default_rng([31, round(size_px)])
     place = rng.random((30, 2)) * [1.0, 0.6] * (np.array(SHAPE) - 1.0)

@@ -150,9 +150,7 @@ def test_lines_end_half_a_pixel_before_the_first_line_behind_a_break() -> None:
 
 
 @pytest.mark.parametrize("counts", list(product((0, 2, 3), repeat=3)))
-def test_a_part_is_held_by_three_active_points_whatever_holds_the_others(
-    counts: tuple[int, int, int],
-) -> None:
+def test_a_part_is_held_by_three_active_points_whatever_others_are(counts: tuple[int, int, int]) -> None:
     """First lines behind breaks belong to the part behind, and the last before them to the other."""
     breaks = np.array([1000, 2500])
     borders = [(0.0, 999.0), (1000.0, 2499.0), (2500.0, 3999.0)]

@@ -170,9 +170,7 @@ MOTIONS = {
 @pytest.mark.thorough
 @pytest.mark.monte_carlo
 @pytest.mark.parametrize("name", list(MOTIONS))
-def test_what_points_show_along_lines_and_samples_is_followed_with_the_stated_accuracy(
-    name: str,
-) -> None:
+def test_what_points_show_along_lines_and_samples_is_followed_as_accurately_as_stated(name: str) -> None:
     trials = [trial(MOTIONS[name], seed) for seed in range(8)]
     assert all(one.adjustment.components for one in trials)
     assert max(one.ratio for one in trials) < WRONG

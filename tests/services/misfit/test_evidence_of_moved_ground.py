@@ -53,9 +53,7 @@ def adjusted(
 
 
 @pytest.mark.parametrize(("share", "size_px", "seed"), [(0.2, 1.5, 1), (0.3, 1.2, 1), (0.2, 1.2, 3)])
-def test_one_of_hundreds_of_areas_is_less_likely_by_their_number(
-    share: float, size_px: float, seed: int
-) -> None:
+def test_one_of_many_areas_is_less_likely_by_the_number(share: float, size_px: float, seed: int) -> None:
     """It is compared with a band of lines or samples that moved, which has as many parameters."""
     diagonal = np.full(2, size_px / np.sqrt(2.0))
     observations, _, adjustment = adjusted(share, diagonal, seed)

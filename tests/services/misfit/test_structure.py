@@ -74,9 +74,7 @@ def test_the_best_of_many_shapes_is_charged_for_all_of_them(family: Family) -> N
 
 
 @pytest.mark.parametrize("family", ["lines", "steps", "samples", "seams", "image", "height"])
-def test_a_structure_is_the_same_wherever_the_points_lie_and_however_large_the_image_is(
-    family: Family,
-) -> None:
+def test_a_structure_is_the_same_wherever_points_lie_and_however_large_the_image(family: Family) -> None:
     """Lines counted from another one, twice the pixels, twice the chips."""
     residuals = independent(np.random.default_rng(77))
     start, times = np.array([9000.0, -700.0]), 2.0

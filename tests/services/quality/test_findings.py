@@ -7,7 +7,7 @@ import pytest
 
 from amers.services.imagery.pixel_checks import Fault, PixelFinding
 from amers.services.misfit.structure import Family, Structure
-from amers.services.quality.findings import shared_residual_px, with_findings
+from amers.services.quality.findings import _parts, shared_residual_px, with_findings
 from amers.services.quality.normal_law import CIRCULAR_CE90
 from amers.services.quality.points_elsewhere import Elsewhere
 from amers.services.quality.qualification import Qualification, QualificationOptions, qualify
@@ -57,6 +57,19 @@ def test_a_fault_with_a_place_is_told_and_harms_by_what_points_show(registered: 
     assert result.verdict == "good"
     assert {one.name for one in result.findings} == {"part of another image", "repeated lines"}
     assert result.predicted.overall_px == qualified(scene).predicted.overall_px
+
+
+def test_parts_of_an_image_end_where_its_breaks_and_faults_are(registered: Make) -> None:
+    """Of 4000 lines of 5000 samples: some are lost behind the named one, or repeat from it on."""
+    kinds = Fault.LOST_SAMPLES, Fault.REPEATED_SAMPLES, Fault.PART, Fault.BANDS
+    faults = tuple(replace(fault(kind, 1.0, 700, 300), sample=2000, samples=900) for kind in kinds)
+    scene = registered().adjusted()
+    broken = replace(scene, breaks=np.array([1300]), pixel_findings=faults)
+    of_breaks = [[0, 1299, 0, 4999], [1300, 3999, 0, 4999]]
+    lost = [[0, 3999, 0, 2000], [0, 3999, 2001, 4999]]
+    repeated = [[0, 3999, 0, 1999], [0, 3999, 2000, 4999]]
+    assert _parts(broken).tolist() == [*of_breaks, *lost, *repeated, [700, 999, 2000, 2899]]
+    assert not len(_parts(scene))
 
 
 @pytest.mark.parametrize(("away_px", "pull_px"), [(0.4, 0.4), (5.0, 1.0), (40.0, 1.0)])
@@ -109,9 +122,7 @@ def test_points_elsewhere_among_the_others_harm_by_their_share(registered: Make)
 
 
 @pytest.mark.parametrize("stated_px", [0.0, 5.0])
-def test_what_neighbours_share_harms_whatever_the_points_state(
-    registered: Make, stated_px: float
-) -> None:
+def test_what_neighbours_share_harms_whatever_points_state(registered: Make, stated_px: float) -> None:
     """A model with too few parameters leaves residuals that neighbours share; points do not."""
     scene = registered(n=300, lost=0, wrong=0)
     measures = replace(scene.measures, active=np.ones(300, dtype=bool))

@@ -54,9 +54,7 @@ def test_the_known_ground_of_a_check_site_takes_no_part(one: Draw, plain: SiteRe
     )
 
 
-def test_what_is_declared_for_a_check_holds_the_frames_of_both_sites(
-    one: Draw, plain: SiteReach
-) -> None:
+def test_what_is_declared_for_a_check_holds_both_frames_of_sites(one: Draw, plain: SiteReach) -> None:
     """That of a vague site counts in full as a check, and beside the images as control."""
     site = one.sites[0]
     frame_m2 = site.ground.frames[0].covariance_m2

@@ -19,9 +19,7 @@ SHAPE = (4000, 3000)
         ("seams", "step", "at sample 800. Possible cause: a seam between detectors"),
     ],
 )
-def test_a_structure_says_where_it_is_and_what_it_looks_like(
-    family: Family, shape: str, words: str
-) -> None:
+def test_a_structure_says_where_and_what_it_is_like(family: Family, shape: str, words: str) -> None:
     structure = Structure(family, 1e-9, shape, 800.0, np.full(2, 2.5), 5.0, np.full(2, np.nan))
     assert words in structure_words(structure, SHAPE)
 

@@ -125,9 +125,7 @@ def test_a_point_that_was_always_hard_to_find_needs_more_scenes(rng: np.random.G
     assert 1 not in vanished
 
 
-def test_the_probability_is_that_of_one_miss_a_quarter_beside_the_other_points(
-    rng: np.random.Generator,
-) -> None:
+def test_the_probability_is_that_of_one_miss_a_quarter_beside_others(rng: np.random.Generator) -> None:
     """Of fifteen points, all others are neighbours; of the scenes of a quarter, the strongest counts."""
     before = ["2021-02-01", "2021-05-01", "2021-08-01", "2021-11-01"]
     quarter = ["01-10", "03-20"], ["04-10", "06-20"]

@@ -46,9 +46,7 @@ def plan() -> PlanReport:
     return plan_report()
 
 
-def test_a_plan_states_its_accuracy_relative_first_and_what_each_further_site_gains(
-    plan: PlanReport,
-) -> None:
+def test_a_plan_states_its_accuracy_relative_first_and_what_each_site_gains(plan: PlanReport) -> None:
     relative, earth, first, second, cost = plan.words
     assert relative.startswith("Relative to the control points: CE90 1.10 m, LE90 1.20 m on average")
     assert relative.endswith("worst place 1.30 m, 1.40 m")
