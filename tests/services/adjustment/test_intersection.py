@@ -123,3 +123,10 @@ def test_derivatives_are_what_small_moves_of_the_ground_show(three: list[ViewGeo
             models, ties.observations, move_metres(ties.lon_lat_h, step_m)
         )
         np.testing.assert_allclose(residual - ahead, derivative[:, :, axis], atol=1e-3)
+
+
+def test_rays_of_nearly_one_view_meet_yet() -> None:
+    pair = ring_of_geometries(2, incidence_deg=0.05)
+    ties = make_ties(pair, np.random.default_rng(0), 20, 0.01)
+    found = intersect([g.rpc for g in pair], ties.observations, 20)
+    assert (np.isfinite(found.lon_lat_h[:, 0]) & (found.angle_deg < 0.2)).all()

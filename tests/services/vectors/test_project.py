@@ -13,6 +13,7 @@ from amers.services.vectors.accuracy import ErrorSources
 from amers.services.vectors.correct import correct_vectors
 from amers.services.vectors.project import (
     ProjectedVectors,
+    _inside,
     cut,
     ground_outline,
     hidden_share,
@@ -135,3 +136,8 @@ def test_the_hidden_share_is_that_of_the_vertices_of_each_geometry() -> None:
     ground = np.zeros((len(hidden), 3))
     share = hidden_share(ProjectedVectors(shapes, ground, hidden, np.zeros(2, dtype=bool), 0))
     np.testing.assert_allclose(share, [1.0 / 3.0, 2.0 / 4.0])
+
+
+def test_an_image_reaches_to_the_borders_of_its_pixels() -> None:
+    places = np.array([[-0.5, 30.5], [9.5, -0.5], [-0.6, 3.0], [9.6, 3.0], [3.0, -0.6], [3.0, 30.6]])
+    assert _inside(places, (10, 31)).tolist() == [True, True, False, False, False, False]
