@@ -127,12 +127,13 @@ def test_measures_leave_one_after_another_and_come_back_within_tolerance() -> No
         return np.abs(values - values[active].mean())
 
     everything = np.ones(6, dtype=bool)
-    left = deactivate(distance_from_the_mean, everything, 3.2, 2)
-    assert left.tolist() == [True, True, True, True, True, False]
+    clean = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 8.0])
+    spoilt = np.where(np.arange(6) == 1, 9.0, clean)
+    left = deactivate(lambda active: spoilt if active[5] else clean, everything, 3.2, 2)
+    assert left.tolist() == [True] * 5 + [False]
     strict = deactivate(distance_from_the_mean, everything, 1.0, 2)
     assert strict.tolist() == [True, True, True, True, False, False]
-    not_a_candidate = everything.copy()
-    not_a_candidate[2] = False
+    not_a_candidate = np.arange(6) != 2
     assert not deactivate(distance_from_the_mean, not_a_candidate, 3.2, 2)[2]
 
 
