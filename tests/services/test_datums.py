@@ -1,12 +1,14 @@
 """Datums of maps: which operation leads to WGS 84, how accurate it is, and when there is none."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from pyproj import Transformer
 
-from amers.services.datums import datum_shift, from_wgs84, to_wgs84
+from amers.services import datums
+from amers.services.datums import datum_shift, filled_sigmas, from_wgs84, to_wgs84
 from amers.services.errors import FormatError
 from amers.services.map_grid import lon_lat_of_xy
 
@@ -71,3 +73,31 @@ def test_positions_in_wgs84_are_bitwise_those_of_proj() -> None:
     np.testing.assert_array_equal(to_wgs84("EPSG:32631").transform(xy[:, 0], xy[:, 1]), expected)
     back = Transformer.from_crs("EPSG:4326", "EPSG:32631", always_xy=True).transform(*expected)
     np.testing.assert_array_equal(from_wgs84("EPSG:32631").transform(*expected), back)
+
+
+def test_sigmas_that_a_user_states_fill_those_that_are_unknown_with_the_datum_in_the_plane() -> None:
+    unknown = np.nan
+    sigma_m = np.array([[unknown] * 3, [1.0, 2.0, 3.0], [unknown, 2.0, unknown]])
+    filled = filled_sigmas(sigma_m, (3.0, 0.5), 4.0)
+    np.testing.assert_allclose(filled, [[5.0, 5.0, 0.5], [1.0, 2.0, 3.0], [5.0, 2.0, 0.5]])
+
+
+def test_a_grid_that_is_not_installed_is_advised_where_it_is_known_to_be_more_accurate(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of NAD27 in the west, whose operation has an accuracy of 7 m."""
+
+    def lacking(*operations: tuple[float, str, str]) -> str:
+        unavailable = [
+            SimpleNamespace(accuracy=accuracy, grids=[SimpleNamespace(short_name=name, url=url)])
+            for accuracy, name, url in operations
+        ]
+        group = SimpleNamespace(unavailable_operations=unavailable)
+        monkeypatch.setattr(datums, "transformations", lambda *_: group)
+        return datum_shift("EPSG:26713", np.array([482e3, 4.34e6]), str(operations)).missing
+
+    url = "https://cdn.proj.org"
+    unknown, as_good, unpublished = (-1.0, "a.tif", url), (7.0, "b.tif", url), (0.1, "c.tif", "")
+    assert lacking(unknown, as_good, unpublished) == ""
+    sentence = lacking(unknown, (2.0, "d.tif", url), (0.15, "e.tif", url), as_good, unpublished)
+    assert sentence == "; 0.15 m with its grid: pyproj sync --file e.tif"

@@ -1,4 +1,6 @@
-"""Coordinates agree with PROJ over the whole globe and survive round trips between frames."""
+"""Coordinates agree with PROJ over the whole globe and survive round trips; the sun is in its place."""
+
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from amers.services.geodesy import (
     longitudes_near,
     metres_per_degree,
     move_metres,
+    sun_direction,
     wrapped_degrees,
 )
 from amers.services.types import Array
@@ -164,3 +167,37 @@ def test_positions_are_continued_from_the_first_of_them() -> None:
 def test_differences_of_longitudes_go_the_short_way_round() -> None:
     difference = wrapped_degrees(np.array([0.0, 359.0, -359.0, 181.0, -181.0, 540.5]))
     np.testing.assert_allclose(difference, [0.0, -1.0, 1.0, -179.0, 179.0, -179.5])
+
+
+@pytest.mark.parametrize(
+    ("month", "day", "hour", "minute", "declination_deg"),
+    [(3, 20, 3, 6, 0.0), (6, 20, 20, 51, 23.44), (9, 22, 12, 44, 0.0), (12, 21, 9, 21, -23.44)],
+)
+def test_the_sun_is_as_high_at_a_pole_as_at_an_equinox_or_a_solstice(
+    month: int, day: int, hour: int, minute: int, declination_deg: float
+) -> None:
+    when = datetime(2024, month, day, hour, minute, tzinfo=UTC)
+    for lon in (-100.0, 0.0, 77.0):
+        heights_deg = [sun_direction(np.array([lon, lat]), when)[0] for lat in (90.0, -90.0)]
+        assert heights_deg == pytest.approx([declination_deg, -declination_deg], abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("month", "day", "late_min"), [(2, 11, 14.2), (5, 14, -3.7), (7, 26, 6.5), (11, 3, -16.4)]
+)
+def test_the_sun_is_in_the_south_at_noon_by_the_equation_of_time_and_east_before(
+    month: int, day: int, late_min: float
+) -> None:
+    """A degree of longitude is four minutes; in the south of the Earth, noon is in the north."""
+    when = datetime(2024, month, day, 13, tzinfo=UTC)
+    lon = (late_min - 60.0) / 4.0
+    for lat, azimuth_deg in ((50.0, 180.0), (-50.0, 0.0)):
+        noon, before, after = (
+            sun_direction(np.array([lon + step, lat]), when) for step in (0.0, -20.0, 20.0)
+        )
+        a_few_seconds_deg = 0.15
+        assert wrapped_degrees(noon[1] - np.array(azimuth_deg)) == pytest.approx(
+            0.0, abs=a_few_seconds_deg
+        )
+        assert noon[0] > max(before[0], after[0])
+        assert before[1] < 180.0 < after[1]

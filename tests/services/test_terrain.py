@@ -213,8 +213,11 @@ def test_a_line_of_sight_that_leaves_the_grid_or_enters_a_void_has_no_intersecti
         intersect_terrain(view(12.0), pixels_of(), replace(terrain(), grid=far))
 
 
-def test_the_range_of_the_ground_holds_a_geoid_whose_extremes_lie_between_its_samples() -> None:
-    """Its waves are eight samples long, so that the samples show 92 % of them."""
+@pytest.mark.parametrize("wave_m", [10.0, 0.0])
+def test_the_range_of_the_ground_holds_a_geoid_whose_extremes_lie_between_its_samples(
+    wave_m: float,
+) -> None:
+    """Its waves are eight samples long, so that the samples show 92 % of them; a flat one is held, too."""
     line, sample = np.indices(SHAPE)
     corners = np.array([[0.0, 0.0], [SHAPE[0] - 1.0, SHAPE[1] - 1.0]])
     north, south = GRID.lon_lat(corners)[:, 1]
@@ -222,14 +225,14 @@ def test_the_range_of_the_ground_holds_a_geoid_whose_extremes_lie_between_its_sa
 
     def geoid(at: Array) -> Array:
         return np.asarray(
-            30.0 + 10.0 * np.sin(np.pi * (8.0 * (at[:, 1] - south) / (north - south) + 1 / 8))
+            30.0 + wave_m * np.sin(np.pi * (8.0 * (at[:, 1] - south) / (north - south) + 1 / 8))
         )
 
     flat = Terrain(GRID, ArrayImage(np.full(SHAPE, 500.0, dtype=np.float32)), geoid)
     low, high = flat.range_m()
     heights = flat.height_m(place)
-    assert low < heights.min() < heights.max() < high
-    assert high - low < 2.0 * np.ptp(heights)
+    assert low < heights.min() <= heights.max() < high
+    assert high - low < 2.0 * np.ptp(heights) + 0.5
 
 
 def test_lines_of_sight_end_on_ground_above_a_geoid() -> None:
@@ -240,6 +243,19 @@ def test_lines_of_sight_end_on_ground_above_a_geoid() -> None:
     np.testing.assert_allclose(met[:, 2], ground.height_m(met[:, :2]), atol=a_millimetre)
 
 
+def test_a_geoid_of_zero_changes_nothing_beside_voids_and_borders_either() -> None:
+    """The vertical lines of the nodes of a map pass voids and end at its borders."""
+    heights = hills()
+    heights[::3, 1::4] = np.nan
+    holed = replace(terrain(), heights=ArrayImage(heights))
+    level = replace(holed, geoid=lambda at: np.zeros(len(at)))
+    at_nodes = np.stack(np.indices(SHAPE), axis=-1).reshape(-1, 2)[::7] - [0.5, 0.5]
+    for model, at in ((OrthoModel(GRID), at_nodes), (view(30.0), pixels_of(3000))):
+        plain, met = (intersect_terrain(model, at, ground) for ground in (holed, level))
+        assert 0.05 < np.isfinite(plain[:, 2]).mean() < 0.95
+        np.testing.assert_allclose(met, plain, atol=a_millimetre)
+
+
 def test_a_terrain_too_large_for_the_memory_is_read_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     model, ground = view(35.0), terrain(60.0)
     whole = intersect_terrain(model, pixels_of(), ground)
@@ -248,6 +264,14 @@ def test_a_terrain_too_large_for_the_memory_is_read_in_parts(monkeypatch: pytest
     parts = intersect_terrain(model, pixels_of(), replace(ground, heights=stored))
     assert len(stored.windows) > 2
     np.testing.assert_allclose(parts[:, 2], whole[:, 2], atol=a_tenth_of_a_millimetre)
+    corner = replace(stored.image, pixels=stored.image.pixels[:130, :120])
+    grid = replace(GRID, shape=corner.shape)
+    inside = intersect_terrain(model, pixels_of(), replace(ground, grid=grid, heights=corner))
+    parts = intersect_terrain(
+        model, pixels_of(), replace(ground, grid=grid, heights=Stored(corner.pixels))
+    )
+    assert 0.05 < np.isnan(inside[:, 2]).mean() < 0.95
+    np.testing.assert_allclose(parts[:, 2], inside[:, 2], atol=a_tenth_of_a_millimetre)
 
 
 def test_the_lines_of_sight_of_an_ortho_image_end_vertically_below() -> None:
@@ -276,5 +300,7 @@ def test_a_terrain_around_the_earth_serves_ground_on_both_sides_of_its_seam(
     a_cell_of_the_cosine_m = 0.05
     np.testing.assert_allclose(around.height_m(lon_lat), expected, atol=a_cell_of_the_cosine_m)
     low, high = around.range_m()
+    with pytest.raises(CoverageError):
+        terrain.around(np.full((3, 2), np.nan))
     assert low <= expected.min() + a_cell_of_the_cosine_m
     assert high >= expected.max() - a_cell_of_the_cosine_m

@@ -8,6 +8,7 @@ import pytest
 from amers.services.sensors.correction import ImageCorrection, no_correction
 from amers.services.sensors.displacement import DisplacementGrid
 from amers.services.sensors.moving_pushbroom import attitude_motion, moving_model
+from amers.services.sensors.piecewise import PiecewisePolynomial
 from amers.services.sensors.pushbroom import PushbroomModel, check_pushbroom
 from amers.services.sensors.pushbroom_errors import TERMS, PushbroomErrors
 from amers.services.simulation.orbit import pushbroom_over
@@ -136,6 +137,28 @@ def test_the_attitude_over_time_displaces_each_line_by_what_was_found() -> None:
 def test_columns_that_move_turn_no_satellite() -> None:
     sideways = smile(-2.0) - smile(-2.0).mean(axis=0)
     assert attitude_motion(a_model(), moved(np.zeros((len(LINES), 2)), sideways)) is None
+
+
+def backwards(part: PiecewisePolynomial) -> PiecewisePolynomial:
+    """A part of the lines of an image that counts them from the other end."""
+    signs = (-1.0) ** np.arange(part.coefficients.shape[2])[::-1]
+    return PiecewisePolynomial(SHAPE[0] - 1.0 - part.breaks[::-1], part.coefficients[::-1] * signs)
+
+
+def test_an_image_whose_last_line_is_scanned_first_moves_as_one_in_the_order_of_its_lines() -> None:
+    model, correction = a_model(), moved(waves((700.0, 1100.0), (3.0, 2.0)))
+    assert correction.displacement is not None
+    flipped = correction.displacement.displacement_px[::-1] * [-1.0, 1.0]
+    turned = replace(model, line_time=backwards(model.line_time))
+    grid = replace(correction.displacement, displacement_px=flipped)
+    moving = moving_model(model, correction)
+    moving_turned = moving_model(turned, replace(correction, displacement=grid))
+    assert moving is not None
+    assert moving_turned is not None
+    ground = ground_in(model)
+    line, sample = moving.project(ground).T
+    expected = np.column_stack([SHAPE[0] - 1.0 - line, sample])
+    np.testing.assert_allclose(moving_turned.project(ground), expected, atol=a_hundredth_of_a_pixel)
 
 
 def test_no_motion_changes_nothing() -> None:

@@ -11,6 +11,7 @@ from amers.services.sensors.correction import (
     ImageCorrection,
     no_correction,
 )
+from amers.services.sensors import rpc_fit
 from amers.services.sensors.pushbroom import PushbroomModel
 from amers.services.sensors.rpc import check_rpc, cubic_terms
 from amers.services.sensors.rpc_fit import fit_rpc, fit_to_ground
@@ -84,6 +85,26 @@ def test_the_error_of_a_bad_fit_is_reported_in_full() -> None:
     assert fit.max_error_px > 0.5
     assert fit.rms_error_px == pytest.approx(np.sqrt((actual_px**2).mean()), rel=0.2)
     assert fit.max_error_px >= 0.8 * actual_px.max()
+
+
+def test_of_fits_that_are_all_too_far_off_the_closest_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """None is close enough; each damping alone gives one, and all together the best of those."""
+    shape = (20_000, 2000)
+    model = fit_rpc(a_pushbroom(shape), shape, HEIGHTS_M).model
+    shaken = a_pushbroom(shape, jitter_px=3.0)
+    monkeypatch.setattr(rpc_fit, "CLOSE_ENOUGH_PX", 0.0)
+    monkeypatch.setattr(rpc_fit, "_GRIDS", ((6, 6, 4), (9, 9, 4)))
+    ridges = rpc_fit.RIDGES
+    together_px = fit_to_ground(model).max_error_px, fit_rpc(shaken, shape, HEIGHTS_M).max_error_px
+    alone_px = []
+    for ridge in ridges:
+        monkeypatch.setattr(rpc_fit, "RIDGES", (ridge,))
+        alone_px.append(
+            (fit_to_ground(model).max_error_px, fit_rpc(shaken, shape, HEIGHTS_M).max_error_px)
+        )
+    nearest_px = np.min(alone_px, axis=0)
+    assert together_px[0] == nearest_px[0] < np.max(alone_px, axis=0)[0]
+    assert together_px[1] <= nearest_px[1]
 
 
 def test_a_full_affine_is_refitted_within_a_hundredth_of_a_pixel() -> None:
