@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from amers.services.geodesy import ecef_from_lon_lat_h
+from amers.services.sensors import parameter_sets
 from amers.services.sensors.light_path import LightPath
 from amers.services.sensors.pushbroom import PushbroomModel
 from amers.services.sensors.pushbroom_errors import TERMS, PushbroomErrors
@@ -154,3 +155,19 @@ def test_the_orbit_moves_ahead_to_the_right_and_upwards(drift: bool) -> None:
         terms[TERMS.index(name)] = 5.0
         moved = PushbroomErrors(model).corrected(terms).line_of_sight(last)[0][0] - origin
         np.testing.assert_allclose(moved, 5.0 * axis, atol=0.02)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_every_term_is_as_free_as_the_set_that_trusts_it_least(
+    order: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In whatever order the sets are listed; terms of the set itself keep their own sigmas."""
+    sets = parameter_sets.PARAMETER_SETS
+    monkeypatch.setattr(parameter_sets, "PARAMETER_SETS", dict(list(sets.items())[::order]))
+    assert set().union(*(one.sigmas for one in sets.values())) <= set(TERMS)
+    for own in sets.values():
+        free = parameter_sets.with_every_term(own).sigmas
+        for term, sigma in free.items():
+            others = [one.sigmas.get(term, 0.0) for one in sets.values()]
+            assert sigma == own.sigmas.get(term, max(others))
+        assert set(parameter_sets.left_out_of(own)) == set(free) - set(own.sigmas)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import sem
 
 from amers.services.surface.fill import filled_gaps
 from amers.services.surface.fuse import alignment_sums, fuse, roughness_m
@@ -92,6 +93,20 @@ def test_pairs_that_see_something_else_widen_the_sigma() -> None:
     assert fused_of(10.0, 10.0, 20.0)[1] > 1.5 * fused_of(10.0, 10.0, np.nan)[1]
 
 
+@pytest.mark.parametrize("apart_m", [(0.0, 0.6), (0.0, 0.5, 0.7), (-0.3, 0.0, 0.4, 0.1)])
+def test_pairs_that_scatter_more_than_they_state_have_the_standard_error_of_their_mean(
+    apart_m: tuple[float, ...],
+) -> None:
+    """No two of them share an image."""
+    count = len(apart_m)
+    heights = (50.0 + np.array(apart_m, dtype=np.float32))[:, None, None]
+    pairs = np.arange(2 * count).reshape(count, 2)
+    found = fuse(heights, np.full(count, 0.01), pairs)
+    assert found.sigma_m[0, 0] == pytest.approx(sem(apart_m), rel=1e-4)
+    assert found.height_m[0, 0] == pytest.approx(50.0 + np.mean(apart_m), abs=1e-4)
+    assert (found.views[0, 0], found.agree[0, 0]) == (2 * count, count)
+
+
 def test_a_plane_is_not_rough() -> None:
     rows, columns = np.indices((40, 40))
     plane = (300.0 + 0.3 * rows - 0.2 * columns).astype(np.float32)
@@ -124,6 +139,19 @@ def test_hidden_ground_is_filled_with_the_lower_side() -> None:
     filled, sigma = gap(heights)
     assert (filled[2:-2, 5:8] == 10.0).all()
     assert (sigma[2:-2, 5:8] > 9.0).all()  # it may be the other side
+
+
+def test_a_filled_cell_is_as_unsure_as_the_second_lowest_beside_it_and_half_their_range() -> None:
+    heights = np.array([[7.0, 3.0, 5.0], [9.0, np.nan, 4.0], [8.0, 6.0, 2.0]], dtype=np.float32)
+    sigmas = heights / np.float32(10.0)
+    filled, sigma = filled_gaps(heights, sigmas, 2)
+    assert filled[1, 1] == 3.0
+    assert sigma[1, 1] == pytest.approx(np.hypot(0.3, (9.0 - 2.0) / 2.0))
+    known = np.isfinite(heights)
+    np.testing.assert_array_equal(filled[known], heights[known])
+    np.testing.assert_array_equal(sigma[known], sigmas[known])
+    heights[0] = heights[1, 0] = np.nan
+    assert np.isnan(filled_gaps(heights, sigmas, 2)[0][1, 1])
 
 
 def test_borders_are_not_moved_and_far_gaps_stay() -> None:
