@@ -140,7 +140,9 @@ def test_a_row_that_is_unknown_has_no_result_and_changes_no_other(name: str) -> 
         np.testing.assert_allclose(one[known], expected[known], **rounding)
 
 
-@pytest.mark.parametrize(("crs", "turn", "seam_deg"), [("EPSG:4326", 360.0, 180.0), ("EPSG:4807", 400.0, -177.66)])
+@pytest.mark.parametrize(
+    ("crs", "turn", "seam_deg"), [("EPSG:4326", 360.0, 180.0), ("EPSG:4807", 400.0, -177.66)]
+)
 def test_positions_on_a_geographic_map_go_on_beyond_its_seam(
     crs: str, turn: float, seam_deg: float
 ) -> None:

@@ -6,16 +6,21 @@ import numpy as np
 import pytest
 
 from amers.services.errors import CoverageError, InputError
+from amers.services.imagery.source import Window
 from amers.services.map_grid import MapGrid, xy_of_lon_lat
-from amers.services.mosaic.layout import MosaicMap, flat_terrain, lay_out
+from amers.services.mosaic import levelling
+from amers.services.mosaic.layout import MosaicMap, Rectifier, flat_terrain, lay_out
+from amers.services.mosaic.levelling import level, overlap_of, unchanged
 from amers.services.mosaic.mosaic import make_mosaic
 from amers.services.mosaic.options import MosaicOptions
 from amers.services.mosaic.steps import seam_places
+from amers.services.mosaic.tiles import TileLabels, TileScenes, tile_task
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.types import FloatImage
 from tests.services.mosaic.worlds import (
     GRID,
     GSD_M,
+    PLACES,
     assembled,
     cut_out,
     layout_of,
@@ -156,10 +161,11 @@ def test_gaps_are_filled_from_other_scenes() -> None:
 def test_a_scene_within_another_adds_no_seam() -> None:
     pixels, grid = cut_out(0)
     inner = replace(grid, origin_xy=grid.xy(np.array([[100.0, 100.0]]))[0], shape=(300, 300))
-    scenes = [scene(0, pixels, grid), scene(1, pixels[:, 100:400, 100:400], inner)]
-    mosaic = mosaic_of(scenes)
-    assert mosaic.steps is None
-    assert (assembled(mosaic)[1] <= 1).all()
+    both = scene(0, pixels, grid), scene(1, pixels[:, 100:400, 100:400], inner)
+    for scenes, shown in ((both, 1), (both[::-1], 2)):
+        mosaic = mosaic_of(scenes)
+        assert mosaic.steps is None
+        assert set(np.unique(assembled(mosaic)[1])) <= {0, shown}
 
 
 def test_scenes_outside_the_box_are_left_out_by_name() -> None:
@@ -226,3 +232,73 @@ def test_places_lie_on_seams_only() -> None:
     assert list(places) == [(0, 1)]
     assert (np.abs(places[0, 1][:, 1] - 80) <= 4).all()
     assert seam_places(labels * 0, 4) == {}
+
+
+def test_scenes_on_both_sides_of_the_antimeridian_lie_on_one_map() -> None:
+    """As on a map elsewhere, window by window: the map of the Pacific goes on beyond 180 degrees."""
+    pacific = replace(GRID, crs="EPSG:3832", origin_xy=np.array([3_339_584.7 - 280.0, 0.0]))
+    scenes = [scene(k, *cut_out(k)) for k in range(3)]
+    moved = [
+        scene(k, cut_out(k)[0], replace(cut_out(k)[1], crs=pacific.crs, origin_xy=pacific.xy(first)[0]))
+        for k, first in enumerate(np.array([[PLACES[k][:2]] for k in range(3)], dtype=np.float64))
+    ]
+    lon = [one.scene.model.locate(np.zeros((1, 2)), np.zeros(1))[0, 0] for one in moved]
+    assert np.ptp(lon) > 359.0
+    found, expected = (
+        lay_out(ones, flat_terrain(0.0), MosaicMap(crs, GSD_M))
+        for ones, crs in ((moved, pacific.crs), (scenes, GRID.crs))
+    )
+    assert found.grid.shape == pytest.approx(expected.grid.shape, abs=4)
+    for one, other in zip(found.windows, expected.windows, strict=True):
+        assert (one.lines, one.samples) == pytest.approx((other.lines, other.samples), abs=4)
+        assert (one.line, one.sample) == pytest.approx((other.line, other.sample), abs=4)
+
+
+def test_a_gap_of_a_tile_is_filled_by_the_number_that_its_scene_has_among_all() -> None:
+    """Scenes 1 and 2 reach the tile, all whose cells are of scene 1; the third has what that lacks."""
+    pixels, grid = cut_out(1)
+    pixels[:, 300:320, 400:420] = np.nan
+    scenes = scene(1, pixels, grid), scene(2, *cut_out(2))
+    layout = layout_of([scene(0, *cut_out(0)), *scenes])
+    window = Window(256, 700, 100, 80)
+    labels = TileLabels(np.full((40, 40), 2, dtype=np.int16), (60, 170), layout.cell_px, 0.0)
+    found = TileScenes((1, 2), scenes, layout.windows[1:], unchanged(2, 2))
+    rectifier = Rectifier(layout.grid, flat_terrain(0.0), MosaicOptions().ortho)
+    made = tile_task(window, labels, found, rectifier)
+    line, sample = (layout.grid.line_sample_of_xy(grid.xy(np.array([[310.0, 410.0]])))[0]).round()
+    at = int(line) - window.line, int(sample) - window.sample
+    assert made["source"][at] == 3
+    assert made["source"][at[0] - 30, at[1] + 15] == 2
+    assert np.isfinite(made["pixels"]).all()
+
+
+def test_many_cells_are_compared_all_over_the_overlap(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ground whose first half is dark: of every third cell, the mean and the spread are those of all."""
+    rng = np.random.default_rng(2)
+    ground = np.concatenate([rng.normal(200.0, 20.0, (1, 3000)), rng.normal(700.0, 60.0, (1, 3000))], 1)
+    values = np.stack([ground, 1.5 * ground + 40.0]).astype(np.float32)
+    whole = overlap_of(0, 1, values)
+    monkeypatch.setattr(levelling, "MOST_CELLS", 2500)
+    part = overlap_of(0, 1, values)
+    assert whole is not None
+    assert part is not None
+    assert part.count == 2000
+    np.testing.assert_allclose(part.mean, whole.mean, rtol=0.02)
+    np.testing.assert_allclose(part.spread, whole.spread, rtol=0.02)
+
+
+def test_levels_keep_the_mean_gain_and_grey_value_of_scenes_that_are_joined() -> None:
+    """The fourth scene has nothing in common with the others, and keeps its grey values."""
+    rng = np.random.default_rng(3)
+    ground = rng.normal(500.0, 90.0, (1, 400))
+    gains, offsets = np.array([1.0, 1.4, 0.6]), np.array([0.0, -90.0, 130.0])
+    seen = gains[:, None, None] * ground + offsets[:, None, None]
+    overlaps = [overlap_of(a, b, seen[[a, b]].astype(np.float32)) for a, b in ((0, 1), (2, 1))]
+    assert None not in overlaps
+    means = np.append(seen.mean(axis=(1, 2)), 321.0)[:, None]
+    levels = level([one for one in overlaps if one is not None], means)
+    levelled = levels.gain[:3, :, None] * seen + levels.offset[:3, :, None]
+    np.testing.assert_allclose(levelled, np.broadcast_to(levelled[:1], levelled.shape), rtol=1e-4)
+    assert np.prod(levels.gain[:3]) == pytest.approx(1.0)
+    assert levelled.mean() == pytest.approx(means[:3].mean())
+    assert (levels.gain[3, 0], levels.offset[3, 0]) == pytest.approx((1.0, 0.0))

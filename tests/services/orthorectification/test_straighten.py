@@ -1,6 +1,7 @@
 """Images without the motion of their lines and samples."""
 
 import numpy as np
+import pytest
 
 from amers.services.imagery.source import ArrayImage, Window
 from amers.services.orthorectification.straighten import shown_at, straighten
@@ -38,6 +39,15 @@ def broken(lost: float) -> ImageCorrection:
     displacement = np.zeros((4, 2, 2))
     displacement[:2, :, 0], displacement[2:, :, 0] = lost / 2.0, -lost / 2.0
     grid = DisplacementGrid(line, sample, displacement, 0.0 * displacement, np.array([349.5]))
+    return ImageCorrection(np.zeros((2, 3)), np.array(SHAPE) / 2.0, np.array(SHAPE) / 2.0, grid)
+
+
+def broken_twice(lost: float) -> ImageCorrection:
+    """An image that lost so many lines at two of them."""
+    line, sample = np.array([-90.0, 199.0, 200.0, 449.0, 450.0, 790.0]), np.array([0.0, 559.0])
+    displacement = np.zeros((6, 2, 2))
+    displacement[:2, :, 0], displacement[4:, :, 0] = lost, -lost
+    grid = DisplacementGrid(line, sample, displacement, 0.0 * displacement, np.array([199.5, 449.5]))
     return ImageCorrection(np.zeros((2, 3)), np.array(SHAPE) / 2.0, np.array(SHAPE) / 2.0, grid)
 
 
@@ -94,6 +104,19 @@ def test_lost_lines_are_a_gap_and_both_sides_keep_their_places() -> None:
     assert np.isnan(out[331:369]).all()
     for rows in (slice(5, 329), slice(371, 675)):
         assert np.abs(out[rows] - expected[rows]).max() < a_hundredth_of_the_contrast
+
+
+@pytest.mark.parametrize("lost", [20.0, -20.0])
+def test_every_break_of_an_image_is_a_gap_of_its_own(lost: float) -> None:
+    """Twenty lines are lost at two breaks, around 199.5 and 449.5, or repeated there."""
+    line, half = np.arange(SHAPE[0], dtype=np.float64), lost / 2.0
+    off = np.select([line < 199.5 + half, line < 449.5 - half], [-lost, 0.0], lost)
+    places = np.stack(np.broadcast_arrays((line + off)[:, None], np.arange(SHAPE[1])[None]), -1)
+    [out] = straightened(broken_twice(lost), ground(places).astype(np.float32))
+    gaps = (np.abs(line[:, None] - [199.5, 449.5]) < 10.0).any(axis=1) & (lost > 0.0)
+    shown = (np.abs(line[:, None] - [199.5, 449.5]) > 12.0).all(axis=1) & (np.abs(line - 349.5) < 325.0)
+    assert np.isnan(out[gaps]).all()
+    assert np.abs(out - ground(every_pixel()))[shown].max() < a_hundredth_of_the_contrast
 
 
 def test_repeated_lines_are_shown_once() -> None:

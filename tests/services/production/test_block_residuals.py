@@ -142,3 +142,12 @@ def test_an_image_is_off_in_metres_and_bent_beside_the_middle_one(scenes: list[S
     np.testing.assert_allclose(np.abs(fits[0].off_m), [0.0, 50.0], atol=0.1)
     assert "its model is bent" in fits[-1].verdict
     assert {one.verdict for one in fits[1:-1]} == {FITS}
+    # Eleven measures are too few, whichever image has them; twelve are enough.
+    for number, enough in ((1, 12), (2, 11)):
+        own = np.flatnonzero(measures.image == number)
+        rows = np.setdiff1d(np.arange(len(measures)), own[enough:])
+        active, residuals_px = block.active[rows], block.residual_px[rows]
+        few = replace(block, active=active, residual_px=0.01 * residuals_px)
+        verdict = image_fits(taken, measures.take(rows), few)[number].verdict
+        assert (verdict == FITS) == (enough == 12)
+        assert verdict == FITS or verdict.startswith("11 measures: it needs more common ground")

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from datetime import UTC, datetime, timedelta
+from itertools import permutations
 
 import pytest
 import shapely
@@ -70,9 +71,14 @@ def test_ground_that_a_swath_cuts_off_gets_its_dates_too() -> None:
     assert len(taken) <= 9
 
 
-def test_of_one_acquisition_the_latest_baseline_counts() -> None:
-    images = [image(0), image(0, id="older", baseline="02.14", accuracy=OLD), image(1)]
-    assert sorted(chosen(images, 3)) == [0, 2]
+@pytest.mark.parametrize("order", list(permutations(range(4))))
+def test_of_one_acquisition_the_latest_baseline_counts_wherever_it_is_listed(
+    order: tuple[int, ...],
+) -> None:
+    older = image(0, id="older", baseline="02.14", accuracy=OLD)
+    images = [image(0), older, image(0, id="oldest", baseline="02.04"), image(1)]
+    listed = [images[k] for k in order]
+    assert {listed[k].id for k in chosen(listed, 3)} == {"image-00", "image-01"}
 
 
 def test_the_fewest_tiles_are_taken_each_with_its_part() -> None:

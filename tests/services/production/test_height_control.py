@@ -142,3 +142,27 @@ def test_the_most_precise_of_many_heights_take_part() -> None:
     above = SurfaceHeights(np.full(len(points), ABOVE_M), sigma_m)
     known = known_heights(points, above, PLACE_M, ground(0.0, 0.0))
     np.testing.assert_array_equal(known.point, np.flatnonzero(sigma_m <= np.sort(sigma_m)[399]))
+
+
+def test_the_roughness_of_noisy_ground_is_that_of_its_noise() -> None:
+    """The square around a point has a node at each of its 49 places; three of them make the plane."""
+    noise_m, count = 0.8, 400
+    posting_m = 2.0 * OFF_M / 3.0
+    grid = replace(
+        GRID,
+        origin_xy=np.array([499_500.0, 100_000.0]),
+        step_xy=np.array([[0.0, posting_m], [-posting_m, 0.0]]),
+    )
+    pixels = np.random.default_rng(4).normal(500.0, noise_m, (SIDE, SIDE)).astype(np.float32)
+    sigma_m = 3.0
+    terrain = Terrain(grid, ArrayImage(pixels), sigmas=sigma_m)
+    axis = np.linspace(10, SIDE - 11, 20).round()
+    nodes = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    points = np.column_stack([grid.lon_lat(nodes), np.zeros(count)])
+    taken = ControlHeights("dem", terrain, Frame.from_sigmas(*DEM_FRAME_M))
+    above = SurfaceHeights(np.full(count, ABOVE_M), np.linspace(0.1, 0.101, count))
+    known = known_heights(points, above, PLACE_M, taken)
+    own_m2 = known.covariance_m2[:, 2, 2] - sigma_m**2 - above.sigma_m[known.point] ** 2
+    # The slopes of 49 heights have a variance of 1 / (196 postings^2) of theirs on both axes.
+    of_slopes = 2.0 * OFF_M**2 / (196.0 * posting_m**2)
+    assert own_m2.mean() == pytest.approx(noise_m**2 * (1.0 + of_slopes), rel=0.03)

@@ -15,11 +15,16 @@ GSD_M = 10.0
 SIDE = 100
 
 
-def strip(number: int, east_m: float, north_m: float = 0.0) -> Scene:
+ACROSS = "EPSG:3832"
+"""A map of the Pacific, which goes on beyond the meridian of 180 degrees."""
+
+
+def strip(number: int, east_m: float, north_m: float = 0.0, crs: str = "EPSG:32631") -> Scene:
     """An image of one square kilometre on the map."""
+    west_m, top_m = (3_338_000.0, 100_000.0) if crs == ACROSS else (500_000.0, 4_800_000.0)
     grid = MapGrid(
-        "EPSG:32631",
-        np.array([500_000.0 + east_m, 4_800_000.0 - north_m]),
+        crs,
+        np.array([west_m + east_m, top_m - north_m]),
         np.array([[0.0, GSD_M], [-GSD_M, 0.0]]),
         (SIDE, SIDE),
     )
@@ -38,9 +43,12 @@ def connected(pairs: IntArray, count: int) -> bool:
     return len(np.unique(group)) == 1
 
 
-def test_images_without_common_ground_are_no_pair() -> None:
-    pairs = image_pairs(row_of(5, 600.0), [])
-    np.testing.assert_array_equal(pairs, [[0, 1], [1, 2], [2, 3], [3, 4]])
+@pytest.mark.parametrize("crs", ["EPSG:32631", ACROSS])
+def test_images_without_common_ground_are_no_pair(crs: str) -> None:
+    scenes = [strip(number, number * 600.0, crs=crs) for number in range(5)]
+    lon = [scene.model.locate(np.zeros((1, 2)), np.zeros(1))[0, 0] for scene in scenes]
+    assert (np.ptp(lon) > 180.0) == (crs == ACROSS)
+    np.testing.assert_array_equal(image_pairs(scenes, []), [[0, 1], [1, 2], [2, 3], [3, 4]])
 
 
 def test_few_images_are_all_matched_with_each_other() -> None:

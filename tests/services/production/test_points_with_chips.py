@@ -185,3 +185,19 @@ def test_too_few_chips_are_refused_with_the_reasons() -> None:
     ground, _ = base()
     with pytest.raises(NotEnoughPoints, match="of 9 points: 9 gone"):
         produce_points_with_chips(ground, own(ground.id, ["gone"] * 9), FRAME)
+
+
+def test_nine_of_ten_chips_fill_the_square_of_a_chip() -> None:
+    """Twenty bases of chips of 42 to 80 pixels: the two smallest leave a border, the others none."""
+    ground, _ = base(20)
+    rng, sides = np.random.default_rng(8), np.random.default_rng(9).permutation(np.arange(42, 82, 2))
+    xy = xy_of_lon_lat(UTM, ground.lon_lat_h[:, :2])
+    chips: list[Scene | str] = [
+        chip_at(at, 10.0, int(side), rng) for at, side in zip(xy, sides, strict=True)
+    ]
+    made = produce_points_with_chips(ground, own(ground.id, chips), FRAME)
+    whole = [bool((made.chips(row) > 0).all()) for row in range(len(made.points))]
+    rows = [ground.id.tolist().index(name) for name in made.source_id]
+    filled = {int(sides[row]) for row, one in zip(rows, whole, strict=True) if one}
+    assert filled >= set(range(46, 82, 2))
+    assert 42 not in filled

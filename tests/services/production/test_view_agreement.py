@@ -8,6 +8,7 @@ import pytest
 from amers.services.errors import NotEnoughPoints
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage, Window
+from amers.services.production import view_agreement
 from amers.services.production.view_agreement import AgreedViews, agreed_views
 from amers.services.types import Acquisition, Array, Observations
 from tests.services.conftest import FlatModel
@@ -158,3 +159,17 @@ def test_ground_beside_all_images_has_no_reference_and_no_views() -> None:
     np.testing.assert_array_equal(views.shown_by, [0, *[2] * 9, 0])
     assert set(views.views.point.tolist()) == set(range(1, 10))
     assert not views.confirmed(1)[[0, -1]].any()
+
+
+def test_tasks_of_any_number_of_points_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Parts of a task are numbered from its first point: those after it are of others."""
+    details, rng = drawn_details(DETAILS), np.random.default_rng(5)
+    off_m = rng.normal(0.0, 1.0, (2, DETAILS**2, 2))
+    images = [details.scene(f"image {k}", off_m[k], 5.0) for k in range(2)]
+    whole = agreed_views(images, details.lon_lat_h, GSD_M)
+    monkeypatch.setattr(view_agreement, "_OF_TASK", 7)
+    parts = agreed_views(images, details.lon_lat_h, GSD_M)
+    for name in ("point", "image", "line_sample"):
+        np.testing.assert_array_equal(getattr(parts.views, name), getattr(whole.views, name))
+    np.testing.assert_array_equal(parts.shift_m, whole.shift_m)
+    assert parts.local_sigma_m == whole.local_sigma_m

@@ -48,7 +48,10 @@ def test_tiles_cover_their_window_once_and_are_smaller_where_heights_differ_more
     expected = np.zeros(GRID.shape, dtype=np.int64)
     expected[7:647, 211:1041] = 1
     np.testing.assert_array_equal(count, expected)
-    sizes = {height: [t.window.samples for t in tiles if t.heights_m == (0.0, height)] for height in (20.0, 300.0)}
+    sizes = {
+        height: [t.window.samples for t in tiles if t.heights_m == (0.0, height)]
+        for height in (20.0, 300.0)
+    }
     assert max(sizes[20.0]) > 3 * max(sizes[300.0])
     assert len({tile.name for tile in tiles}) == len(tiles)
     assert [tile.heights_m for tile in tiles_of(GRID, WINDOW, lambda _: None, 1.0)] == [None]
@@ -85,7 +88,9 @@ class Stated:
     sigma_m: float
 
     def read(self, window: Window) -> SurfaceTile:
-        place = np.s_[window.line : window.line + window.lines, window.sample : window.sample + window.samples]
+        place = np.s_[
+            window.line : window.line + window.lines, window.sample : window.sample + window.samples
+        ]
         height_m = self.height_m[place]
         views = np.full(self.height_m.shape, 2, dtype=np.uint8)
         views[::50] = 0
