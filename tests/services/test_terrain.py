@@ -217,7 +217,7 @@ def test_a_line_of_sight_that_leaves_the_grid_or_enters_a_void_has_no_intersecti
 def test_the_range_of_the_ground_holds_a_geoid_whose_extremes_lie_between_its_samples(
     wave_m: float,
 ) -> None:
-    """Its waves are eight samples long, so that the samples show 92 % of them; a flat one is held, too."""
+    """Its waves are eight samples long, so that the samples show 92 % of them; or there is none."""
     line, sample = np.indices(SHAPE)
     corners = np.array([[0.0, 0.0], [SHAPE[0] - 1.0, SHAPE[1] - 1.0]])
     north, south = GRID.lon_lat(corners)[:, 1]

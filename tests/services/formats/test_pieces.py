@@ -52,7 +52,10 @@ def mosaic_at(*places: str | Path) -> ImageMosaic:
 def assert_same(found: ImageMosaic, whole: Path) -> None:
     expected = open_raster(whole)
     assert found.shape == expected.shape
-    for window in WINDOWS:
+    # Lines and columns of one pixel are those of the last and the first pixels of tiles, too.
+    lines = [Window(at, 700, 1, 600) for at in range(997, 1003)] + [Window(SIDE - 1, 0, 1, SIDE)]
+    columns = [Window(w.sample, w.line, w.samples, w.lines) for w in lines]
+    for window in (*WINDOWS, *lines, *columns):
         np.testing.assert_array_equal(found.read(window), expected.read(window))
     expected.close()
     found.close()
@@ -133,6 +136,33 @@ def test_items_apart_from_the_scene_are_not_opened(whole: Path, tmp_path: Path) 
     assert [place.name for place in near] == ["tile_0_0.tif"]
     others = pieces_of(tmp_path / "tiles", IMAGES)
     assert open_mosaic(others, corner).shape == (1100, 1100)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, -360.0])
+@pytest.mark.parametrize(
+    ("west", "east", "names"),
+    [(179.2, 179.6, ["here"]), (179.6, 180.2, ["here", "across"]), (180.3, 181.0, ["across", "east"])],
+)
+def test_items_are_taken_whose_boxes_meet_an_outline_on_either_side_of_the_antimeridian(
+    tmp_path: Path, west: float, east: float, names: list[str], turn_deg: float
+) -> None:
+    """Boxes touch where they share an edge; one has heights, and one crosses the meridian."""
+    boxes = {
+        "here": [179.0, -1.0, 5.0, 179.7, 1.0, 90.0],
+        "across": [179.6001, -1.0, -179.7, 1.0],
+        "east": [-179.6, -1.0, -179.0, 1.0],
+        "north": [179.0, 1.5, -179.0, 2.0],
+    }
+    rows = []
+    for name, box in boxes.items():
+        (tmp_path / f"{name}.tif").write_bytes(b"")
+        asset = {"href": f"./{name}.tif", "type": "image/tiff; application=geotiff"}
+        feature = {"type": "Feature", "stac_version": "1.0.0", "id": name, "bbox": box}
+        rows.append(json.dumps(feature | {"assets": {"visual": asset}}))
+    (tmp_path / "items.ndjson").write_text("\n".join(rows))
+    outline = np.array([[west, -0.5], [east, -0.5], [east, 1.0], [west, 1.0]]) + [turn_deg, 0.0]
+    found = pieces_of(tmp_path / "items.ndjson", IMAGES, outline)
+    assert [place.stem for place in found] == names  # type: ignore[union-attr]
 
 
 def test_tiles_of_two_zones_side_by_side_are_one_image(whole: Path, tmp_path: Path) -> None:

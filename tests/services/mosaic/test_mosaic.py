@@ -252,6 +252,9 @@ def test_scenes_on_both_sides_of_the_antimeridian_lie_on_one_map() -> None:
     for one, other in zip(found.windows, expected.windows, strict=True):
         assert (one.lines, one.samples) == pytest.approx((other.lines, other.samples), abs=4)
         assert (one.line, one.sample) == pytest.approx((other.line, other.sample), abs=4)
+    zone = lay_out(moved, flat_terrain(0.0), MosaicMap(None, GSD_M)).grid
+    assert zone.crs in ("EPSG:32601", "EPSG:32660", "EPSG:32701", "EPSG:32760")
+    assert zone.shape == pytest.approx(expected.grid.shape, rel=0.05)
 
 
 def test_a_gap_of_a_tile_is_filled_by_the_number_that_its_scene_has_among_all() -> None:

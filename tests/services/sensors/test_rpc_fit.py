@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from amers.services.errors import CoverageError
+from amers.services.sensors import rpc_fit
 from amers.services.sensors.correction import (
     CorrectedModel,
     ImageCorrection,
     no_correction,
 )
-from amers.services.sensors import rpc_fit
 from amers.services.sensors.pushbroom import PushbroomModel
 from amers.services.sensors.rpc import check_rpc, cubic_terms
 from amers.services.sensors.rpc_fit import fit_rpc, fit_to_ground

@@ -93,10 +93,12 @@ def test_chips_of_a_folder_are_identical_to_those_written(block):
             assert_array_equal(point_chips(contents.points, chips, row), block.chips(row))
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_chips_continue_in_a_second_file_without_splitting_a_point(tmp_path, monkeypatch, dtype):
+@pytest.mark.parametrize(("dtype", "chips_of_a_file"), [(np.uint8, 12), (np.uint16, 17)])
+def test_chips_continue_in_a_second_file_without_splitting_a_point(
+    tmp_path, monkeypatch, dtype, chips_of_a_file
+):
     chip_bytes = 101 * 101 * np.dtype(dtype).itemsize
-    monkeypatch.setattr(writer, "CHIP_FILE_BYTES", 14 * chip_bytes)
+    monkeypatch.setattr(writer, "CHIP_FILE_BYTES", chips_of_a_file * chip_bytes)
 
     block = make_block(tmp_path / "block", count=7, dtype=dtype)
 
