@@ -197,6 +197,30 @@ def test_a_model_that_heights_bend_beyond_the_tolerance_is_refused(
     assert a_hundredth_of_a_pixel < error_px < 1.02 * mapping.error_px
 
 
+@dataclass(frozen=True)
+class Wavy(FlatModel):
+    """A plane whose lines move along the samples, by waves of 17 pixels."""
+
+    wave_px: float = 0.0
+
+    def project(self, lon_lat_h: Array) -> Array:
+        plain = super().project(lon_lat_h)
+        return plain + self.wave_px * np.sin(2.0 * np.pi * plain[:, 1:] / 17.0) * [1.0, 0.0]
+
+
+def test_a_model_is_followed_by_nodes_at_every_second_pixel_and_no_closer() -> None:
+    """Their middles miss 0.07 of a wave, those of nodes at every fourth pixel 0.26."""
+    step = np.array([[0.0, 1.0], [-1.0, 0.0]]) * 0.5 * METRE_DEG
+    grid = MapGrid("EPSG:4326", np.zeros(2), step, (130, 140))
+    ground = Terrain(grid, ArrayImage(np.zeros(grid.shape, dtype=np.float32)))
+    window = Window(0, 0, *grid.shape)
+    mapping = map_into_image(Wavy(wave_px=1.0), ground, grid, window, the_tolerance_px)
+    assert mapping is not None
+    assert 0.05 < mapping.error_px < the_tolerance_px
+    with pytest.raises(ComputationError, match=r"every second pixel leave an error of 0\.1"):
+        map_into_image(Wavy(wave_px=2.0), ground, grid, window, the_tolerance_px)
+
+
 def test_small_windows_and_divided_ones_give_the_same_image(monkeypatch: pytest.MonkeyPatch) -> None:
     ground = terrain()
     grid = choose_grid(scene(), ground)

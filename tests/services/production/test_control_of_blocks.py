@@ -8,14 +8,25 @@ import pytest
 
 from amers.services.adjustment.control_ground import ControlGround
 from amers.services.errors import NotEnoughPoints
+from amers.services.geodesy import move_metres
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage, render_chip
 from amers.services.matching.multi_image import stored_chip
 from amers.services.production.control import Control, MeasuredPoints, with_control
 from amers.services.production.control_points import ControlBlock, find_control
 from amers.services.production.marked_control import MarkedGround
+from amers.services.production.placed_block import find_in_block, moved_points
+from amers.services.simulation.orbit import pushbroom_over
 from amers.services.tasks import Work
-from amers.services.types import Array, ControlPoints, Frame, Observations, Views, no_progress
+from amers.services.types import (
+    Acquisition,
+    Array,
+    ControlPoints,
+    Frame,
+    Observations,
+    Views,
+    no_progress,
+)
 from tests.services.production.displaced_details import (
     GSD_M,
     drawn_details,
@@ -155,6 +166,50 @@ def test_points_are_searched_as_far_as_both_frames_reach_and_no_farther() -> Non
         found_in([block], scenes=images(0.0, 18.0))
 
 
+def marked(name: str, lon_lat_h: Array, shown: Array) -> MarkedGround:
+    """Ground (n, 3) marked in two images at positions (2, n, 2)."""
+    count = len(lon_lat_h)
+    marks = Observations(
+        np.repeat(np.arange(count), 2),
+        np.tile([0, 1], count),
+        shown.swapaxes(0, 1).reshape(-1, 2),
+        np.ones(2 * count),
+    )
+    sigma_m, frame = np.full((count, 3), 0.5), Frame.from_sigmas(0.1, 0.2)
+    return MarkedGround(tuple(f"{name}{row}" for row in range(count)), lon_lat_h, sigma_m, frame, marks)
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_three_known_points_are_enough_where_the_rays_of_a_block_meet(count: int) -> None:
+    """Marked in images that look from two sides, in a block that lies off; its points are elsewhere."""
+    off_m, own = np.array([30.0, -20.0, 12.0]), older("own", [0, 4]).points
+    target = own.lon_lat_h[0] + [0.0, 0.0, 50.0]
+    models = [
+        pushbroom_over(target, (400, 400), 1.0, (25.0, azimuth_deg), (0.0, 300.0))
+        for azimuth_deg in (80.0, 250.0)
+    ]
+    blank = ArrayImage(np.zeros((400, 400), dtype=np.float32))
+    scenes = [Scene(blank, model, Acquisition(f"image {k}"), 1.0) for k, model in enumerate(models)]
+    at = np.random.default_rng(6).uniform(-60.0, 60.0, (count, 3))
+    in_block = move_metres(np.tile(target, (count, 1)), at)
+    shown = np.stack([model.project(in_block) for model in models])
+    control = Control(
+        marked=(marked("mark", move_metres(in_block, -np.tile(off_m, (count, 1))), shown),)
+    )
+    if count < 3:
+        with pytest.raises(NotEnoughPoints):
+            find_in_block(scenes, own, control)
+        return
+    found = find_in_block(scenes, own, control)
+    assert found.known.names == tuple(f"mark{row}" for row in range(count))
+    np.testing.assert_allclose(east_north_m(in_block, found.lon_lat_h), 0.0, atol=1e-3)
+    np.testing.assert_allclose(found.lon_lat_h[:, 2], in_block[:, 2], atol=1e-3)
+    assert (np.linalg.eigvalsh(found.covariance_m2) > 0.0).all()
+    moved = moved_points(own, off_m)
+    np.testing.assert_allclose(east_north_m(own.lon_lat_h, moved.lon_lat_h), [off_m[:2]] * 2, atol=1e-3)
+    np.testing.assert_allclose(moved.lon_lat_h[:, 2], own.lon_lat_h[:, 2] + off_m[2])
+
+
 def test_points_of_a_block_of_its_blocks_and_of_marks_are_numbered_one_after_the_other() -> None:
     details, scenes = drawn_details(SIDE), images()[:2]
     own = details.lon_lat_h[:4] + [0.0, 0.0, 10.0]
@@ -163,23 +218,15 @@ def test_points_of_a_block_of_its_blocks_and_of_marks_are_numbered_one_after_the
         np.repeat(np.arange(4), 2), np.tile([0, 1], 4), np.repeat(shown[:4], 2, axis=0), np.ones(8)
     )
 
-    def marked(name: str, rows: list[int]) -> MarkedGround:
-        return MarkedGround(
-            names=tuple(f"{name}:{100 + row}" for row in rows),
-            lon_lat_h=details.lon_lat_h[rows],
-            sigma_m=np.full((len(rows), 3), 0.5),
-            frame=Frame.from_sigmas(0.1, 0.2),
-            marks=Observations(
-                np.repeat(np.arange(len(rows)), 2),
-                np.tile([0, 1], len(rows)),
-                np.repeat(shown[rows], 2, axis=0),
-                np.ones(2 * len(rows)),
-            ),
-        )
-
     control = Control(
         blocks=(older("one", [0, 4, 7]), older("two", [2, 5])),
-        marked=(marked("red", [1, 6]), marked("blue", [3, 8, 0])),
+        marked=tuple(
+            replace(
+                marked("", details.lon_lat_h[rows], np.stack([shown[rows]] * 2)),
+                names=tuple(f"{name}:{100 + row}" for row in rows),
+            )
+            for name, rows in (("red", [1, 6]), ("blue", [3, 8, 0]))
+        ),
     )
     observations, known = with_control(
         scenes, MeasuredPoints(own, OWN, GSD_M, measures), control, work=Work(), progress=no_progress

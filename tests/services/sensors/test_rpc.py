@@ -82,25 +82,6 @@ def test_positions_far_away_are_nan_and_do_not_affect_others(far: float) -> None
     assert np.isnan(MODEL.project_derivative(ground)[:3]).all()
 
 
-@pytest.mark.parametrize("rows", [0, 1, 255, 256, 257, 1000])
-def test_any_number_of_rows_gives_the_same_result_as_one_by_one(rows: int) -> None:
-    ground = ground_of(MODEL, rows, extent=2.5)
-    projected, derivative = MODEL.project(ground), MODEL.project_derivative(ground)
-    line_sample = np.random.default_rng(8).uniform(-60_000.0, 90_000.0, (rows, 2))
-    located = MODEL.locate(line_sample, ground[:, 2])
-    assert (projected.shape, derivative.shape, located.shape) == ((rows, 2), (rows, 2, 3), (rows, 3))
-    assert rows < 255 or 0 < np.isnan(projected[:, 0]).sum() < rows
-    assert rows < 255 or 0 < np.isnan(located[:, 0]).sum() < rows
-    for i in range(rows):
-        one = slice(i, i + 1)
-        for together, alone in (
-            (projected[i], MODEL.project(ground[one])[0]),
-            (derivative[i], MODEL.project_derivative(ground[one])[0]),
-            (located[i], MODEL.locate(line_sample[one], ground[one, 2])[0]),
-        ):
-            np.testing.assert_allclose(together, alone, rtol=1e-12, atol=a_nanopixel)
-
-
 def test_arrays_of_any_memory_layout_are_accepted() -> None:
     ground = ground_of(MODEL, 50)
     columns_first = np.asfortranarray(ground)

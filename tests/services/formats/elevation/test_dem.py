@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import from_origin
 
-from amers.services.errors import CoverageError, FormatError, VerticalDatumError
+from amers.services.errors import FormatError, VerticalDatumError
 from amers.services.formats.elevation.dem import read_dem
 from amers.services.formats.elevation.filled_voids import FilledVoids
 from amers.services.formats.elevation.geoid import geoid_of_grid
@@ -82,19 +82,6 @@ def test_heights_above_the_ellipsoid_are_read_unchanged(tmp_path: Path) -> None:
     assert terrain.posting_m == pytest.approx(30.0, rel=1e-3)
 
 
-def test_a_file_without_a_datum_needs_one_from_the_caller(tmp_path: Path) -> None:
-    path = write_dem(tmp_path / "a.tif")
-    with pytest.raises(VerticalDatumError, match=r"a\.tif.*does not state its vertical datum"):
-        read_dem(path)
-    assert "by the caller" in read_dem(path, "ellipsoid").vertical
-
-
-def test_a_file_with_three_axes_has_ellipsoidal_heights(tmp_path: Path) -> None:
-    terrain = read_dem(write_dem(tmp_path / "a.tif", "EPSG:4979"))
-    assert terrain.vertical == "metres above the ellipsoid, by the file"
-    assert terrain.geoid is None
-
-
 def test_the_heights_of_a_geoid_are_added_to_heights_above_it(tmp_path: Path) -> None:
     grid = write_geoid(tmp_path / "geoid of a place.gtx")
     terrain = read_dem(write_dem(tmp_path / "a.tif", "EPSG:4326+5773"), geoid=grid)
@@ -105,14 +92,6 @@ def test_the_heights_of_a_geoid_are_added_to_heights_above_it(tmp_path: Path) ->
     low, high = terrain.range_m()
     assert low <= expected.min()
     assert high >= expected.max()
-
-
-def test_heights_in_feet_become_metres(tmp_path: Path) -> None:
-    grid = write_geoid(tmp_path / "geoid.gtx")
-    feet = read_dem(write_dem(tmp_path / "a.tif", "EPSG:4326+8228"), geoid=grid)
-    above = read_dem(write_dem(tmp_path / "b.tif", "EPSG:4326"), "ellipsoid")
-    expected = 0.3048 * above.height_m(nodes(above)) + undulation(nodes(above))
-    np.testing.assert_allclose(feet.height_m(nodes(above)), expected, atol=a_millimetre)
 
 
 def test_a_geoid_without_its_grid_is_an_error_that_names_it(tmp_path: Path) -> None:
@@ -129,12 +108,9 @@ def test_a_geoid_without_its_grid_is_an_error_that_names_it(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("crs", "vertical", "grid", "expected"),
     [
-        ("EPSG:4326+5773", "ellipsoid", False, "above EGM96 height, the caller the ellipsoid"),
-        ("EPSG:4979", "EGM96", False, "above the ellipsoid, the caller EGM96 height"),
         ("EPSG:4979", None, True, "need no geoid"),
         ("EPSG:4326", "ellipsoid", True, "need no geoid"),
         ("EPSG:4326", "mean sea level", False, "expected ellipsoid"),
-        ("EPSG:4326+6357", None, True, "NAVD88 depth found, which counts depths"),
     ],
 )
 def test_contradictory_datums_are_refused(
@@ -143,12 +119,6 @@ def test_contradictory_datums_are_refused(
     geoid = write_geoid(tmp_path / "geoid.gtx") if grid else None
     with pytest.raises(VerticalDatumError, match=expected):
         read_dem(write_dem(tmp_path / "a.tif", crs), vertical, geoid)
-
-
-def test_a_geoid_of_another_region_is_refused(tmp_path: Path) -> None:
-    grid = write_geoid(tmp_path / "geoid.gtx", west=100.0)
-    with pytest.raises(CoverageError, match="does not cover the terrain"):
-        read_dem(write_dem(tmp_path / "a.tif"), geoid=grid)
 
 
 @pytest.mark.thorough
@@ -178,24 +148,6 @@ def test_an_image_without_a_map_grid_is_refused_as_terrain(tmp_path: Path) -> No
         file.write(np.ones((9, 9), np.int16), 1)
     with pytest.raises(FormatError, match="no reference system"):
         read_dem(path, "ellipsoid")
-
-
-def test_declared_and_undeclared_voids_are_nan(tmp_path: Path) -> None:
-    heights = HEIGHTS.astype(np.int16)
-    heights[10, 10], heights[20, 20], heights[30, 30], heights[40, 40] = -32768, -9999, 32767, 77
-    terrain = read_dem(write_dem(tmp_path / "a.tif", heights=heights, nodata=77), "ellipsoid")
-    void = np.array([[10.0, 10.0], [20.0, 20.0], [30.0, 30.0], [40.0, 40.0]])
-    assert np.isnan(terrain.height_m(terrain.grid.lon_lat(void))).all()
-    assert terrain.range_m() == (float(HEIGHTS.min()), float(HEIGHTS.max()))
-
-
-def test_scale_and_offset_of_a_file_are_applied(tmp_path: Path) -> None:
-    path = write_dem(tmp_path / "a.tif", heights=(HEIGHTS * 10.0).astype(np.int16))
-    with rasterio.open(path, "r+") as file:
-        file.scales, file.offsets = (0.1,), (5.0,)
-    terrain = read_dem(path, "ellipsoid")
-    low, high = terrain.range_m()
-    assert (low, high) == pytest.approx((HEIGHTS.min() + 5.0, HEIGHTS.max() + 5.0), abs=a_decimetre)
 
 
 def test_scale_and_offset_of_a_file_are_in_its_unit(tmp_path: Path) -> None:

@@ -10,11 +10,10 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-from amers.services.errors import FormatError, VerticalDatumError
+from amers.services.errors import FormatError
 from amers.services.formats.elevation import mosaic
 from amers.services.formats.elevation.dem import read_dem
 from amers.services.imagery.source import Window
-from tests.services.formats.elevation.test_dem import write_geoid
 
 a_millimetre = 1e-3
 WGS84_PRJ = (
@@ -156,15 +155,6 @@ def test_a_terrain_of_any_kind_has_the_heights_of_its_ground_in_every_window(
         np.testing.assert_allclose(found[:, 0], expected[:, sample + 3], atol=a_millimetre)
 
 
-def test_an_hgt_is_above_egm96_by_its_format_unless_the_caller_states_otherwise(tmp_path: Path) -> None:
-    geoid = write_geoid(tmp_path / "geoid.gtx")
-    assert read_dem(hgt(tmp_path), geoid=geoid).vertical == "EGM96 height by its format, from geoid.gtx"
-    assert read_dem(hgt(tmp_path), "ellipsoid").geoid is None
-    named = hgt(tmp_path, "elevation.hgt")
-    with pytest.raises(FormatError, match=r"elevation\.hgt: the place .* N44E005\.hgt"):
-        read_dem(named)
-
-
 def test_the_voids_of_a_grid_are_void(tmp_path: Path) -> None:
     terrain = read_dem(hgt(tmp_path), "ellipsoid")
     assert np.isnan(terrain.heights.read(Window(600, 600, 1, 1))).all()
@@ -194,24 +184,6 @@ def test_a_vrt_refers_to_files_of_its_folder_and_computes_nothing(
     tile(tmp_path / "outside.tif", 5.03, 44.0)
     with pytest.raises(FormatError, match=message):
         read_dem(vrt(folder, names, extra), "ellipsoid")
-
-
-def with_unit(path: Path, unit: str) -> None:
-    with rasterio.open(path, "r+") as file:
-        file.units = (unit,)
-
-
-def test_a_vrt_has_the_unit_and_the_datum_of_its_sources_where_it_repeats_none(tmp_path: Path) -> None:
-    two_tiles(tmp_path, crs="EPSG:4326+5773")
-    for name in ("a.tif", "b.tif"):
-        with_unit(tmp_path / name, "ft")
-    geoid = write_geoid(tmp_path / "geoid.gtx")
-    terrain = read_dem(vrt(tmp_path), geoid=geoid)
-    assert terrain.vertical.startswith("EGM96 height by the file")
-    assert terrain.nodes()[0, 0] == pytest.approx(0.3048 * plane(5.0005, 43.9995), abs=a_millimetre)
-    with_unit(tmp_path / "b.tif", "m")
-    with pytest.raises(VerticalDatumError, match=r"a\.tif states unit ft.*b\.tif unit m"):
-        read_dem(vrt(tmp_path), geoid=geoid)
 
 
 def test_files_of_strangers_are_images_only(tmp_path: Path) -> None:
@@ -261,22 +233,3 @@ def test_few_tiles_are_open_at_a_time(tmp_path: Path, monkeypatch: pytest.Monkey
     terrain = read_dem(tmp_path, "ellipsoid")
     assert np.isfinite(terrain.nodes()).all()
     assert len(terrain.heights._open) == 2
-
-
-def test_tiles_of_other_datums_or_of_the_same_ground_are_refused(tmp_path: Path) -> None:
-    geoid = write_geoid(tmp_path / "geoid.gtx")
-    folder = tmp_path / "tiles"
-    folder.mkdir()
-    tile(folder / "a_dem.tif", 5.0, 44.0, crs="EPSG:4326+5773")
-    tile(folder / "b_dem.tif", 5.03, 44.0, crs="EPSG:4326+3855")
-    with pytest.raises(VerticalDatumError, match=r"a_dem\.tif has EGM96 .*b_dem\.tif EGM2008"):
-        read_dem(folder, geoid=geoid)
-    tile(folder / "b_dem.tif", 5.0, 44.0, crs="EPSG:4326+5773")
-    with pytest.raises(FormatError, match=r"a_dem\.tif and b_dem\.tif cover the same ground"):
-        read_dem(folder, geoid=geoid)
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(FormatError, match=r"a folder with files of heights, .* found 0"):
-        read_dem(tmp_path / "empty", "ellipsoid")
-    (tmp_path / "list.txt").write_text("nowhere.tif\n")
-    with pytest.raises(FormatError, match=r"nowhere\.tif does not exist"):
-        read_dem(tmp_path / "list.txt", "ellipsoid")

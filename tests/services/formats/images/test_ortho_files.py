@@ -325,13 +325,6 @@ def test_a_mask_of_sixteen_bits_may_use_its_largest_value(tmp_path: Path) -> Non
     np.testing.assert_array_equal(np.isnan(image.read(ALL)), cloud[0])
 
 
-@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-def test_a_mask_of_another_shape_is_refused(tmp_path: Path) -> None:
-    mask = write(tmp_path / "mask.tif", np.ones((1, 80, 80), np.uint8), Affine.identity(), "")
-    with pytest.raises(FormatError, match=r"mask\.tif.*80 x 80"):
-        read_scene(write(tmp_path / "a.tif"), sigma_m=1.0, mask=mask)
-
-
 @pytest.mark.real_data
 def test_sentinel_2_crops_agree_except_for_their_known_shift(real_data: Path) -> None:
     folder = real_data / "s2a_berlin_pair"

@@ -98,20 +98,6 @@ def test_every_allowed_kind_of_file_is_read(
     np.testing.assert_array_equal(image.read(Window(0, 0, *PIXELS.shape)), PIXELS)
 
 
-def test_only_nodata_is_nan(tmp_path: Path) -> None:
-    image = open_raster(write(tmp_path / "a.tif", nodata=int(PIXELS[3, 4])))
-    read = image.read(Window(0, 0, *PIXELS.shape))
-    np.testing.assert_array_equal(np.isnan(read), PIXELS[3, 4] == PIXELS)
-
-
-def test_pixels_under_a_mask_are_nan(tmp_path: Path) -> None:
-    valid = np.zeros(PIXELS.shape, dtype=np.uint16)
-    valid[10:20, 30:50] = 65535
-    path = write(tmp_path / "a.tif", np.stack([PIXELS, valid]), photometric="MINISBLACK", ALPHA="YES")
-    read = open_raster(path).read(Window(0, 0, *PIXELS.shape))
-    np.testing.assert_array_equal(np.isfinite(read), valid > 0)
-
-
 def test_a_quick_view_is_of_an_overview_where_the_file_has_one(tmp_path: Path) -> None:
     path = write(tmp_path / "a.tif", np.tile(PIXELS, (3, 2)))
     with rasterio.open(path, "r+") as file:
@@ -217,12 +203,6 @@ def test_a_small_file_that_declares_an_enormous_image_is_refused(tmp_path: Path)
     ):
         pass
     with pytest.raises(FormatError, match="declares 100000 lines of 100000 samples"):
-        open_raster(path)
-
-
-def test_complex_pixels_are_refused(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.tif", PIXELS.astype(np.complex64))
-    with pytest.raises(FormatError, match="expected integer or floating-point pixels, found complex64"):
         open_raster(path)
 
 

@@ -3,7 +3,6 @@
 import math
 import shutil
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -85,17 +84,6 @@ def test_a_model_beside_the_image_is_found(
     assert delivered.path.name == sidecar
     assert delivered.crop_origin == (0.0, 0.0)
     assert misfit_px(delivered.model, CROP) < a_millionth_of_a_pixel
-
-
-def test_files_beside_come_before_tags_as_in_gdal_and_an_explicit_model_before_all(
-    tmp_path: Path,
-) -> None:
-    path = write_image(tmp_path / "a.tif", tagged=CROP)
-    (tmp_path / "a_RPC.TXT").write_text(format_rpc_text(replace(CROP, error_bias_m=9.0)))
-    (tmp_path / "mine.txt").write_text(format_rpc_text(replace(CROP, error_bias_m=8.0)))
-    assert read_rpc(path).convention == "text"
-    assert read_rpc(path).model.error_bias_m == 9.0
-    assert read_rpc(path, tmp_path / "mine.txt").model.error_bias_m == 8.0
 
 
 def test_without_a_model_the_message_lists_the_files_searched_for(tmp_path: Path) -> None:
@@ -191,40 +179,6 @@ def test_ground_moved_along_the_viewing_direction_stays_in_the_image(tmp_path: P
     azimuth_deg = np.degrees(np.arctan2(east, north)) % 360.0
     assert scene.acquisition.incidence_deg == pytest.approx(incidence_deg, abs=a_hundredth_of_a_degree)
     assert scene.acquisition.azimuth_deg == pytest.approx(azimuth_deg, abs=a_hundredth_of_a_degree)
-
-
-def test_sensor_and_time_are_read_from_the_tags_of_the_image(tmp_path: Path) -> None:
-    tags = {"MISSION": "PHR", "MISSION_INDEX": "1B"}
-    tags |= {"IMAGING_DATE": "2013-02-08", "IMAGING_TIME": "08:36:09.1Z"}
-    scene = read_scene(write_image(tmp_path / "a.tif", tagged=CROP, **tags))
-    assert scene.acquisition.sensor == "PHR1B"
-    assert scene.acquisition.acquired_at == datetime(2013, 2, 8, 8, 36, 9, 100_000, tzinfo=UTC)
-
-
-def test_the_time_is_read_from_the_metadata_beside_a_worldview_image(tmp_path: Path) -> None:
-    path = write_image(tmp_path / "a.tif")
-    (tmp_path / "a.RPB").write_text(format_rpb(CROP, "WV02"))
-    assert read_scene(path).acquisition.acquired_at is None
-    (tmp_path / "a.IMD").write_text(
-        'version = "28.3";\nBEGIN_GROUP = IMAGE_1\n\tsatId = "WV02";\n'
-        "\tfirstLineTime = 2012-05-17T10:42:31.123456Z;\nEND_GROUP = IMAGE_1\nEND;\n"
-    )
-    acquisition = read_scene(path).acquisition
-    assert (acquisition.sensor, acquisition.acquired_at) == (
-        "WV02",
-        datetime(2012, 5, 17, 10, 42, 31, 123_456, tzinfo=UTC),
-    )
-
-
-def test_the_sensor_is_read_from_the_product_document_beside_the_rpc(tmp_path: Path) -> None:
-    path = write_image(tmp_path / "IMG_a.tif")
-    (tmp_path / "RPC_a.XML").write_text(format_dimap_rpc(V2, CROP))
-    assert read_scene(path).acquisition.sensor == "PHR"
-    (tmp_path / "DIM_a.XML").write_text(
-        "<Dimap_Document><Strip_Source><MISSION>PHR</MISSION><MISSION_INDEX>1A</MISSION_INDEX>"
-        "</Strip_Source></Dimap_Document>"
-    )
-    assert read_scene(path).acquisition.sensor == "PHR1A"
 
 
 PRODUCT = """<Dimap_Document><Raster_Data><Raster_Display>

@@ -99,11 +99,6 @@ def test_version_3_may_start_at_one() -> None:
 
 
 @both_versions
-def test_the_errors_of_the_fit_are_not_the_accuracy_of_the_scene(text: str) -> None:
-    assert np.isnan(parse_dimap_rpc(text).error_bias_m)
-
-
-@both_versions
 def test_a_shift_and_a_drift_move_both_models_of_the_document(text: str) -> None:
     assert contradiction_px(text) < a_hundredth_of_a_pixel
     model = corrected([[40.0, 2.0, 0.0], [-25.0, 0.0, -1.5]])
