@@ -8,12 +8,13 @@ import pytest
 from amers.services.errors import CoverageError, InputError
 from amers.services.imagery.source import Window
 from amers.services.map_grid import MapGrid, xy_of_lon_lat
+from amers.services.mosaic import layout as layouts
 from amers.services.mosaic import levelling
 from amers.services.mosaic.layout import MosaicMap, Rectifier, flat_terrain, lay_out
 from amers.services.mosaic.levelling import level, overlap_of, unchanged
 from amers.services.mosaic.mosaic import make_mosaic
 from amers.services.mosaic.options import MosaicOptions
-from amers.services.mosaic.steps import seam_places
+from amers.services.mosaic.steps import seam_places, seam_steps
 from amers.services.mosaic.tiles import TileLabels, TileScenes, tile_task
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.types import FloatImage
@@ -305,3 +306,52 @@ def test_levels_keep_the_mean_gain_and_grey_value_of_scenes_that_are_joined() ->
     assert np.prod(levels.gain[:3]) == pytest.approx(1.0)
     assert levelled.mean() == pytest.approx(means[:3].mean())
     assert (levels.gain[3, 0], levels.offset[3, 0]) == pytest.approx((1.0, 0.0))
+
+
+@pytest.mark.parametrize(("name", "most"), [("_MAP_CELLS", 5000), ("_SCENE_CELLS", 2000)])
+def test_cells_are_as_large_as_their_number_allows_and_hold_every_pixel(
+    name: str, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenes = [scene(k, *cut_out(k)) for k in range(3)]
+    assert layout_of(scenes).cell_px == 4
+    monkeypatch.setattr(layouts, name, most)
+    layout = layout_of(scenes)
+    cells = [layout.cell_window(number) for number in range(3)]
+    counted = (
+        [np.prod(layout.cells.shape)] if name == "_MAP_CELLS" else [w.lines * w.samples for w in cells]
+    )
+    assert 0.7 * most < max(counted) < 1.2 * most
+    side = layout.cell_px
+    for pixels, own in zip(layout.windows, cells, strict=True):
+        for first, size, cell, count in (
+            (pixels.line, pixels.lines, own.line, own.lines),
+            (pixels.sample, pixels.samples, own.sample, own.samples),
+        ):
+            assert (first // side, (first + size - 1) // side) == (cell, cell + count - 1)
+
+
+def test_steps_of_seams_are_told_by_their_median_and_what_nine_of_ten_are_below() -> None:
+    """Of two seams, the second of which has a model before registration, too; some are not found."""
+    east = np.arange(101.0)
+    used = np.column_stack([east, np.zeros(101)])
+    unknown = np.full((4, 2), np.nan)
+    found = {
+        (0, 1): {"used": np.concatenate([used, unknown])},
+        (1, 2): {"used": -used[:1], "delivered": np.array([[3.0, -4.0]])},
+    }
+    together, (first, second) = seam_steps(("a", "b", "c"), found)
+    assert (first.scenes, second.scenes) == (("a", "b"), ("b", "c"))
+    assert (first.places, first.used.found, second.places) == (105, 101, 1)
+    assert (first.used.median_m, first.used.p90_m, first.used.east_m) == pytest.approx(
+        (50.0, 90.0, 50.0)
+    )
+    assert first.delivered is None
+    assert second.delivered is not None
+    assert (second.delivered.median_m, second.delivered.east_m, second.delivered.north_m) == (
+        5.0,
+        3.0,
+        -4.0,
+    )
+    assert together is not None
+    assert (together.places, together.used.found) == (106, 102)
+    assert seam_steps(("a",), {}) == (None, ())

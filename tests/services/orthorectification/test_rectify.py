@@ -197,6 +197,22 @@ def test_a_model_that_heights_bend_beyond_the_tolerance_is_refused(
     assert a_hundredth_of_a_pixel < error_px < 1.02 * mapping.error_px
 
 
+def test_a_part_of_a_map_is_made_as_in_the_whole() -> None:
+    ground = terrain()
+    grid = choose_grid(scene(), ground)
+    whole, part = assembled(ramps(), ground, grid, window_px=64), Window(128, 192, 150, 100)
+    count = np.zeros(grid.shape, dtype=np.int64)
+    options = OrthoOptions(window_px=64)
+    for one in orthorectify(ramps(), scene().model, ground, grid, options, part=part):
+        at = one.window
+        place = np.s_[at.line : at.line + at.lines, at.sample : at.sample + at.samples]
+        count[place] += 1
+        np.testing.assert_allclose(one.pixels, whole[:, *place], atol=a_hundredth_of_a_pixel)
+    expected_count = np.zeros(grid.shape, dtype=np.int64)
+    expected_count[128:278, 192:292] = 1
+    np.testing.assert_array_equal(count, expected_count)
+
+
 @dataclass(frozen=True)
 class Wavy(FlatModel):
     """A plane whose lines move along the samples, by waves of 17 pixels."""

@@ -9,7 +9,12 @@ from amers.services.errors import CoverageError, InputError
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage
 from amers.services.orthorectification.point_terrain import terrain_of_points
-from amers.services.orthorectification.tile_limits import TILE_PX, TilePlace, choose_tiles
+from amers.services.orthorectification.tile_limits import (
+    TILE_PX,
+    TilePlace,
+    choose_tiles,
+    tiles_over,
+)
 from amers.services.sensors.rpc import RpcModel
 from amers.services.types import Acquisition, Array
 
@@ -144,3 +149,12 @@ def test_points_on_a_line_give_the_heights_of_the_nearest(count: int) -> None:
 def test_without_points_there_are_no_heights() -> None:
     with pytest.raises(CoverageError, match="at least one"):
         terrain_of_points(np.zeros((0, 3)), np.array([[5.0, 43.0], [5.1, 43.1]]))
+
+
+@pytest.mark.parametrize("turn_deg", [-720.0, -360.0, 360.0])
+@pytest.mark.parametrize("west_deg", [-179.9, -20.0, 179.9])
+def test_whole_turns_of_longitude_change_no_tile(west_deg: float, turn_deg: float) -> None:
+    outline = np.array([[0.0, 40.0], [0.3, 40.1], [0.2, 40.3], [-0.05, 40.2]]) + [west_deg, 0.0]
+    expected = tiles_over(outline, 5.0, 5000 * 5000)
+    assert expected[0].columns > 5
+    assert tiles_over(outline + [turn_deg, 0.0], 5.0, 5000 * 5000) == expected

@@ -46,6 +46,8 @@ def test_points_are_confirmed_by_enough_images_or_by_all_that_show_them() -> Non
     views = agreed((2.0, 2.0, 2.0), np.zeros((3, 2)))
     np.testing.assert_array_equal(views.confirmed(3), [True, False, False, False, True])
     np.testing.assert_array_equal(views.confirmed(2), [True, True, False, False, True])
+    np.testing.assert_array_equal(views.confirmed(1, 0.5), [True, True, False, False, True])
+    np.testing.assert_array_equal(views.confirmed(1, 1.0), [True, False, False, False, True])
     taken = views.take(np.array([1, 4]))
     np.testing.assert_array_equal(taken.point, [0, 0, 1])
     np.testing.assert_array_equal(taken.image, [0, 1, 2])

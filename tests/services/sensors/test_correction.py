@@ -171,6 +171,15 @@ def test_a_chip_shows_the_mean_of_what_lies_under_it_where_lines_and_samples_mov
     assert np.abs(grid.at(middles) - means).max() > 0.3
 
 
+def test_a_displacement_is_inverted_where_lines_and_samples_keep_their_order() -> None:
+    """Of nodes some tens of pixels apart that move by up to a pixel, beside an affine correction."""
+    moved = correction([[40.0, 300.0, -200.0], [-25.0, 100.0, 400.0]])
+    moved = replace(moved, displacement=uneven_grid())
+    at = np.concatenate([inside(uneven_grid(), 0.0), [[-500.0, 90.0], [9000.0, 20_000.0]]])
+    assert np.abs(uneven_grid().at(at)).max() > 1.0
+    np.testing.assert_allclose(moved.invert(moved.apply(at)), at, atol=rounding_of_the_image_px)
+
+
 def test_no_correction_changes_nothing() -> None:
     at = np.array([[0.0, 0.0], [123.0, 456.0]])
     np.testing.assert_allclose(no_correction(SHAPE).apply(at), at, rtol=0.0, atol=a_nanopixel)

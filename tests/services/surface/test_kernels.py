@@ -89,6 +89,15 @@ def test_pairs_that_share_an_image_have_noise_in_common() -> None:
     assert apart < shared < 0.2
 
 
+@pytest.mark.parametrize(
+    "pairs", [[[0, 1], [0, 2]], [[0, 1], [2, 0]], [[1, 0], [0, 2]], [[1, 0], [2, 0]]]
+)
+def test_half_of_the_noise_of_pairs_is_that_of_the_image_they_share(pairs: list[list[int]]) -> None:
+    found = fuse(np.full((2, 1, 1), 10.0, dtype=np.float32), np.full(2, 0.2), np.array(pairs))
+    assert found.sigma_m[0, 0] == pytest.approx(0.2 * np.sqrt((1.0 + 0.5) / 2.0))
+    assert found.views[0, 0] == 3
+
+
 def test_pairs_that_see_something_else_widen_the_sigma() -> None:
     assert fused_of(10.0, 10.0, 20.0)[1] > 1.5 * fused_of(10.0, 10.0, np.nan)[1]
 

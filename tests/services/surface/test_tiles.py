@@ -1,6 +1,7 @@
 """Tiles and windows of a grid cover it once, and two surfaces tell how the later one lies off."""
 
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from amers.services.imagery.source import ArrayImage, Window
 from amers.services.map_grid import MapGrid
 from amers.services.surface.difference import TwoSurfaces
-from amers.services.surface.pairs import candidate_pairs
+from amers.services.surface.pairs import Pair, candidate_pairs, choose_pairs
 from amers.services.surface.surface import SurfaceTile
 from amers.services.surface.tiles import coarser, part_of_grid, tiles_of, windows_of
 from amers.services.types import Array, FloatImage
@@ -77,6 +78,31 @@ def test_a_small_image_within_a_large_one_is_its_partner() -> None:
     for scenes in ([large, few], [few, large]):
         (pair,) = candidate_pairs(scenes, heights_m, bases)
         assert pair.base_to_height == pytest.approx(whole[0].base_to_height, abs=0.01)
+
+
+def test_a_pair_is_half_as_good_after_sixty_days_whichever_image_is_the_first() -> None:
+    first, second = scene("left"), scene("right")
+    day = datetime(2024, 5, 1, 10, tzinfo=UTC)
+
+    def merit(days: float) -> float:
+        taken = replace(first.acquisition, acquired_at=day)
+        other = replace(second.acquisition, acquired_at=day + timedelta(days=days))
+        scenes = [replace(first, acquisition=taken), replace(second, acquisition=other)]
+        (pair,) = candidate_pairs(scenes, (140.0, 180.0), (0.1, 0.9))
+        assert pair.days == pytest.approx(abs(days))
+        return pair.merit
+
+    assert merit(60.0) == pytest.approx(merit(0.0) / 2.0) == merit(-60.0)
+
+
+def test_images_that_no_pair_uses_yet_come_first_in_either_place_of_a_pair() -> None:
+    """An image that is used leaves 0.8 of the merit of a pair."""
+    outline = np.zeros((3, 2))
+    for again in ((0, 3), (3, 0), (1, 3), (3, 1)):
+        numbers = ((0, 1, 1.0), (*again, 0.9), (4, 5, 0.75))
+        pairs = [Pair(a, b, 0.4, 0.0, outline, merit) for a, b, merit in numbers]
+        assert [pairs.index(one) for one in choose_pairs(pairs, 3)] == [0, 2, 1]
+        assert [pairs.index(one) for one in choose_pairs(pairs, 2)] == [0, 2]
 
 
 @dataclass(frozen=True)

@@ -150,6 +150,15 @@ def test_an_image_without_a_map_grid_is_refused_as_terrain(tmp_path: Path) -> No
         read_dem(path, "ellipsoid")
 
 
+def test_heights_that_no_ground_has_are_voids(tmp_path: Path) -> None:
+    heights = HEIGHTS.copy()
+    stated_m = [-11_101.0, -11_099.0, 8_999.0, 9_001.0]
+    heights[[10, 20, 30, 40], 10] = stated_m
+    terrain = read_dem(write_dem(tmp_path / "a.tif", heights=heights), "ellipsoid")
+    found_m = terrain.nodes()[[10, 20, 30, 40], 10]
+    np.testing.assert_array_equal(found_m, [np.nan, *stated_m[1:3], np.nan])
+
+
 def test_scale_and_offset_of_a_file_are_in_its_unit(tmp_path: Path) -> None:
     grid, scale_offset = write_geoid(tmp_path / "geoid.gtx"), (0.5, 400.0)
     in_feet = write_dem(tmp_path / "feet.tif", "EPSG:4326+8228", scale_offset=scale_offset)

@@ -106,9 +106,13 @@ def test_it_is_the_same_in_a_part_in_another_process_and_in_tiles(
     assert np.isfinite(filled.sigma_m(places())).all()
 
 
-def test_tiles_of_which_one_states_no_sigma_have_that_of_their_distance(tmp_path: Path) -> None:
+@pytest.mark.parametrize("plain", ["east.tif", "west.tif"])
+def test_tiles_of_which_one_states_no_sigma_have_that_of_their_distance(
+    plain: str, tmp_path: Path
+) -> None:
     write_surface(tmp_path / "west.tif", 0, 250)
-    with rasterio.open(write_surface(tmp_path / "east.tif", 250), "r+") as file:
+    write_surface(tmp_path / "east.tif", 250)
+    with rasterio.open(tmp_path / plain, "r+") as file:
         file.descriptions = ("", "", "", "")
     assert read_dem(tmp_path).sigmas is None
     np.testing.assert_allclose(read_dem(tmp_path).sigma_m(places()), HEIGHT_SIGMA_POSTINGS * GSD_M, 0.01)
