@@ -18,12 +18,16 @@ from amers.services.formats.sensor_models.correction_json import (
     parse_correction,
     parse_correction_accuracy,
 )
-from amers.services.formats.sensor_models.refined_model import Stated, write_refined
+from amers.services.formats.sensor_models.refined_model import (
+    AdjustedRigorous,
+    Stated,
+    write_refined,
+)
 from amers.services.formats.sensor_models.rpc_files import ImageFiles
 from amers.services.quality.correction_accuracy import CorrectionAccuracy
 from amers.services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
 from amers.services.sensors.displacement import DisplacementGrid
-from amers.services.sensors.refined import REFIT_LIMIT_PX, refined_rpc
+from amers.services.sensors.refined import REFIT_LIMIT_PX, RefinedRpc, refined_rpc
 from amers.services.simulation.orbit import pushbroom_over
 from tests.services.formats.statements.scene_files import CROP, write_image
 
@@ -265,3 +269,33 @@ def test_an_rpc_that_misses_more_than_is_stated_is_not_written(
     assert "correction.json" in names
     assert ("OFF" if written else "no refined RPC is written") in left.note
     assert {path.name for path in (tmp_path / "o").iterdir()} == names
+
+
+@pytest.mark.parametrize(
+    ("off_px", "stated_px", "says"),
+    [
+        (0.09, 0.0, "refined_RPC.TXT"),
+        (0.11, 0.0, "WARNING: more than 0.1 px off"),
+        (0.49, 0.2, "WARNING: more than 0.1 px off"),
+        (0.51, 0.2, "no refined RPC is written"),
+        (0.69, 0.7, "WARNING: more than 0.1 px off"),
+        (0.71, 0.7, "no refined RPC is written"),
+    ],
+)
+def test_an_rpc_fitted_to_a_rigorous_model_warns_or_is_left_out_the_farther_it_is_off(
+    registered, tmp_path: Path, off_px: float, stated_px: float, says: str
+) -> None:
+    """Beyond half a pixel where no more is stated, and with a warning beyond a tenth."""
+    image = write_image(tmp_path / "a.tif")
+    model = AdjustedRigorous(CROP, (100.0, 700.0), 0.02, RefinedRpc(CROP, off_px))
+    left = write_refined(
+        ImageFiles(image),
+        model,
+        registered().adjustment,
+        shape=(60, 80),
+        folder=tmp_path / "out",
+        stated=Stated(ce90_px=stated_px),
+    )
+    assert left.note.startswith(says)
+    assert left.max_error_px == off_px
+    assert (len(left.files) == 1) == says.startswith("no refined")
