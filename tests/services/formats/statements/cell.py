@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from amers.services.errors import InputError
-from amers.services.formats.reader_rows import Outcome
+from amers.services.formats.reader_rows import Outcome, Reader
 from amers.services.statements import Statements, Subject, Use
 
 CELLS: list["Cell"] = []
@@ -67,3 +67,13 @@ def cell(reader: str, subject: Subject, outcome: Outcome, shows: str) -> Callabl
         return read
 
     return add
+
+
+def add(reader: Reader, subject: Subject, outcome: Outcome, shows: str, name: str, read: Read) -> None:
+    """Add a cell with a name for the test."""
+
+    def named(folder: Path) -> Any:
+        return read(folder)
+
+    named.__name__ = name
+    cell(reader.name, subject, outcome, shows)(named)

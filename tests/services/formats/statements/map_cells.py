@@ -13,8 +13,8 @@ from amers.services.formats.elevation.rows import MAP_READER
 from amers.services.formats.images.scenes import read_scene
 from amers.services.imagery.scene import Scene
 from amers.services.statements import Subject
-from tests.services.formats.statements.cell import Read
-from tests.services.formats.statements.terrain_cells import SYSTEMS, add, with_epoch
+from tests.services.formats.statements.cell import Read, add
+from tests.services.formats.statements.terrain_cells import SYSTEMS, with_epoch
 
 SIGMA_M = 1.0
 

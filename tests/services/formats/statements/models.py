@@ -1,6 +1,7 @@
 """Files with models: RPC text, RPB, ISD, DIMAP, `.geom`, `.aux.xml`, orbit and attitude."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import Window
 from amers.services.statements import Subject
 from tests.services.formats.sensor_models import simulated_metadata as simulated
-from tests.services.formats.statements.cell import cell
+from tests.services.formats.statements.cell import add, cell
 from tests.services.formats.statements.scene_files import (
     CROP,
     DIMAP_2,
@@ -76,29 +77,22 @@ def kompsat_with_units(folder: Path) -> Scene:
     return right(beside(folder, "a.rpc", "\n".join(rows)), CROP)
 
 
-@cell(TEXT, Subject.MODEL, "refused", "LINE_OFF is missing")
-def text_without_a_key(folder: Path) -> Scene:
-    return beside(folder, "a_RPC.TXT", without(text(), r"LINE_OFF.*\n"))
-
-
-@cell(TEXT, Subject.MODEL, "refused", "SAMP_OFF is given twice")
-def text_with_a_key_twice(folder: Path) -> Scene:
-    return beside(folder, "a_RPC.TXT", text() + "\nSAMP_OFF: 7\n")
-
-
-@cell(TEXT, Subject.UNIT, "refused", "HEIGHT_OFF in 'feet' found, metres expected")
-def text_with_heights_in_feet(folder: Path) -> Scene:
-    return beside(folder, "a_RPC.TXT", text(HEIGHT_OFF="1500 feet"))
-
-
-@cell(TEXT, Subject.UNIT, "refused", "LAT_OFF in 'radians' found, degrees expected")
-def text_with_latitudes_in_radians(folder: Path) -> Scene:
-    return beside(folder, "a_RPC.TXT", text(LAT_OFF="0.8 radians"))
-
-
-@cell(TEXT, Subject.UNIT, "refused", "LINE_SCALE in 'meters' found, pixels expected")
-def text_with_lines_in_metres(folder: Path) -> Scene:
-    return beside(folder, "a_RPC.TXT", text(LINE_SCALE="21000 meters"))
+MODEL, UNIT = Subject.MODEL, Subject.UNIT
+for name, subject, shows, content in (
+    ("without_a_key", MODEL, "LINE_OFF is missing", without(text(), r"LINE_OFF.*\n")),
+    ("with_a_key_twice", MODEL, "SAMP_OFF is given twice", f"{text()}\nSAMP_OFF: 7\n"),
+    ("in_feet", UNIT, "HEIGHT_OFF in 'feet' found, metres expected", text(HEIGHT_OFF="1500 feet")),
+    ("in_radians", UNIT, "LAT_OFF in 'radians' found, degrees expected", text(LAT_OFF="0.8 radians")),
+    ("in_metres", UNIT, "LINE_SCALE in 'meters' found, pixels expected", text(LINE_SCALE="2 meters")),
+    (
+        "with_the_name_of_a_satellite",
+        Subject.IDENTITY,
+        "line 1: expected 'KEY: number', found 'SATELLITE: XX01'",
+        "SATELLITE: XX01\n" + text(),
+    ),
+):
+    read = partial(beside, name="a_RPC.TXT", text=content)
+    add(RPC_TEXT_READER, subject, "refused", shows, f"text_{name}", read)
 
 
 @cell(TEXT, Subject.ACCURACY, "used", "a_RPC.TXT: accuracy: 2.50 m, one sigma: used")
@@ -112,11 +106,6 @@ def text_with_a_stated_error(folder: Path) -> Scene:
 @cell(TEXT, Subject.ACCURACY, "assumed", "50.00 m, one sigma: assumed (the sensor is unknown")
 def text_without_errors(folder: Path) -> Scene:
     return beside(folder, "a_RPC.TXT", FORMATS["text"](UNKNOWN))
-
-
-@cell(TEXT, Subject.IDENTITY, "refused", "line 1: expected 'KEY: number', found 'SATELLITE: XX01'")
-def text_with_the_name_of_a_satellite(folder: Path) -> Scene:
-    return beside(folder, "a_RPC.TXT", "SATELLITE: XX01\n" + text())
 
 
 @cell(RPB, Subject.MODEL, "used", "a.RPB: sensor model: RPB: used")
@@ -215,18 +204,6 @@ def dimap_of_version_2(folder: Path) -> Scene:
     return right(beside(folder, "RPC_a.XML", FORMATS["dimap 2"](CROP), "IMG_a_R1C1.TIF"), CROP)
 
 
-@cell(DIMAP, Subject.MODEL, "used", "RPC_PNEO3_F_1.XML: sensor model: RPC of DIMAP: used")
-def dimap_of_pleiades_neo_by_its_delivered_name(folder: Path) -> Scene:
-    text = FORMATS["dimap 3"](CROP)
-    return right(beside(folder, "RPC_PNEO3_F_1.XML", text, "IMG_PNEO3_F_1_P_R1C1.TIF"), CROP)
-
-
-@cell(DIMAP, Subject.MODEL, "used", "RPC_PNEO3_F_1.XML: sensor model: RPC of DIMAP: used")
-def dimap_of_the_colours_of_pleiades_neo(folder: Path) -> Scene:
-    text = FORMATS["dimap 3"](CROP)
-    return right(beside(folder, "RPC_PNEO3_F_1.XML", text, "IMG_PNEO3_F_1_RGB_R1C1.TIF"), CROP)
-
-
 @cell(DIMAP, Subject.MODEL, "refused", "LINE_NUM_COEFF_1")
 def dimap_without_a_coefficient(folder: Path) -> Scene:
     head, _, model = DIMAP_2.partition("<Inverse_Model>")
@@ -234,14 +211,18 @@ def dimap_without_a_coefficient(folder: Path) -> Scene:
     return beside(folder, "RPC_a.XML", changed, "IMG_a.tif")
 
 
-@cell(DIMAP, Subject.PIXEL_ORIGIN, "used", "first pixel (1, 1): used")
-def dimap_that_counts_from_1(folder: Path) -> Scene:
-    return beside(folder, "RPC_a.XML", DIMAP_2, "IMG_a.tif")
-
-
-@cell(DIMAP, Subject.PIXEL_ORIGIN, "used", "first pixel (0, 0): used")
-def dimap_that_counts_from_0(folder: Path) -> Scene:
-    return beside(folder, "RPC_a.XML", DIMAP_3, "IMG_a.tif")
+for name, bands in (
+    ("dimap_of_pleiades_neo_by_its_delivered_name", "P"),
+    ("dimap_of_the_colours_of_pleiades_neo", "RGB"),
+):
+    file, image = "RPC_PNEO3_F_1.XML", f"IMG_PNEO3_F_1_{bands}_R1C1.TIF"
+    read = partial(beside, name=file, text=FORMATS["dimap 3"](CROP), image=image)
+    shows = f"{file}: sensor model: RPC of DIMAP: used"
+    add(dimap.READER, MODEL, "used", shows, name, lambda folder, read=read: right(read(folder), CROP))
+for first, document in ((1, DIMAP_2), (0, DIMAP_3)):
+    read = partial(beside, name="RPC_a.XML", text=document, image="IMG_a.tif")
+    shows = f"first pixel ({first}, {first}): used"
+    add(dimap.READER, Subject.PIXEL_ORIGIN, "used", shows, f"dimap_that_counts_from_{first}", read)
 
 
 def tiles_of_dimap(folder: Path, size: tuple[int, int] = SHAPE) -> None:
@@ -481,21 +462,22 @@ def world_file_that_contradicts_the_image(folder: Path) -> Scene:
     return read_scene(image, sigma_m=5.0)
 
 
-@cell(WORLD, Subject.PLACE, "refused", "5 numbers found, the 6 of a world file expected")
-def world_file_without_an_origin(folder: Path) -> Scene:
-    return with_world_file(folder, "10 0 0 -10 334005", UTM)
-
-
 @cell(WORLD, Subject.HORIZONTAL_DATUM, "used", "WGS 84 / UTM zone 33N: used")
 def prj_beside_a_world_file(folder: Path) -> Scene:
     return with_world_file(folder, WORLD_TEXT, UTM)
 
 
-@cell(WORLD, Subject.HORIZONTAL_DATUM, "refused", "a reference system as WKT expected")
-def prj_with_words(folder: Path) -> Scene:
-    return with_world_file(folder, WORLD_TEXT, "the usual one")
-
-
-@cell(WORLD, Subject.HORIZONTAL_DATUM, "refused", "a.tfw has a geotransform and no reference system")
-def world_file_without_prj(folder: Path) -> Scene:
-    return with_world_file(folder, WORLD_TEXT)
+for shows, content, prj in (
+    ("5 numbers found, the 6 of a world file expected", "10 0 0 -10 334005", UTM),
+    ("a reference system as WKT expected", WORLD_TEXT, "the usual one"),
+    ("a.tfw has a geotransform and no reference system", WORLD_TEXT, ""),
+):
+    subject = Subject.PLACE if content != WORLD_TEXT else Subject.HORIZONTAL_DATUM
+    add(
+        WORLD_FILE_READER,
+        subject,
+        "refused",
+        shows,
+        shows,
+        partial(with_world_file, text=content, prj=prj),
+    )

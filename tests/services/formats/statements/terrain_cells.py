@@ -16,12 +16,12 @@ from amers.services.formats.elevation.rows import (
     TERRAIN_READER,
     TILES_READER,
 )
-from amers.services.formats.reader_rows import Outcome, Reader
+from amers.services.formats.reader_rows import Outcome
 from amers.services.statements import Subject
 from amers.services.terrain import Terrain
 from tests.services.formats.elevation.test_dem import write_geoid
 from tests.services.formats.elevation.test_grid_files import asc, bil, envi, hgt, tile, two_tiles, vrt
-from tests.services.formats.statements.cell import Read, cell
+from tests.services.formats.statements.cell import Read, add, cell
 
 US_FT = 1200.0 / 3937.0
 HEIGHT = 1200.0
@@ -75,23 +75,6 @@ def checked(terrain: Terrain, height_m: float | None) -> Terrain:
         found = terrain.height_m(terrain.grid.lon_lat(np.array([[4.0, 4.0]])))[0]
         assert found == pytest.approx(height_m, abs=2e-3, nan_ok=True)
     return terrain
-
-
-def add(
-    reader: Reader,
-    subject: Subject,
-    outcome: Outcome,
-    shows: str,
-    name: str,
-    read: Callable[[Path], Any],
-) -> None:
-    """Add a cell with a name for the test."""
-
-    def named(folder: Path) -> Any:
-        return read(folder)
-
-    named.__name__ = name
-    cell(reader.name, subject, outcome, shows)(named)
 
 
 def terrain_of(height_m: float | None = None, vertical: str | None = "ellipsoid", **form: Any) -> Read:

@@ -12,8 +12,8 @@ from amers.services.statements import Subject
 from amers.services.terrain import Terrain
 from tests.services.formats.elevation.test_dem import write_geoid
 from tests.services.formats.elevation.test_grid_files import WGS84_PRJ, bil
-from tests.services.formats.statements.cell import Read, cell
-from tests.services.formats.statements.terrain_cells import HEIGHT, US_FT, add, dem, terrain_of
+from tests.services.formats.statements.cell import Read, add, cell
+from tests.services.formats.statements.terrain_cells import HEIGHT, US_FT, dem, terrain_of
 
 WGS84 = (
     'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],'
