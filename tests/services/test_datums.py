@@ -101,3 +101,11 @@ def test_a_grid_that_is_not_installed_is_advised_where_it_is_known_to_be_more_ac
     assert lacking(unknown, as_good, unpublished) == ""
     sentence = lacking(unknown, (2.0, "d.tif", url), (0.15, "e.tif", url), as_good, unpublished)
     assert sentence == "; 0.15 m with its grid: pyproj sync --file e.tif"
+
+
+@pytest.mark.parametrize(("metres", "is_null"), [(0.005, True), (0.05, False), (5.0, False)])
+def test_an_operation_that_moves_positions_by_more_than_a_centimetre_is_not_null(
+    metres: float, is_null: bool
+) -> None:
+    crs = f"+proj=utm +zone=31 +ellps=GRS80 +towgs84=0,{metres},0,0,0,0,0 +units=m +type=crs"
+    assert datum_shift(crs, np.array([5e5, 5e6]), "a.tif").is_null is is_null

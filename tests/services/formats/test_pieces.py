@@ -18,6 +18,7 @@ from amers.services.formats.images.mosaic import ImageMosaic, open_mosaic
 from amers.services.formats.images.raster import map_grid_of, open_raster
 from amers.services.formats.pieces import IMAGES, pieces_of, source_of
 from amers.services.imagery.source import Window
+from amers.services.map_grid import xy_of_lon_lat
 from tests.services.file_server import served_folder
 from tests.services.pieces_world import as_safe, catalogue, cut, in_zone, item, packed
 
@@ -282,3 +283,18 @@ def test_what_has_no_pieces_is_refused(
 ) -> None:
     with pytest.raises(FormatError, match=reason):
         pieces_of(source_of([make(tmp_path)]), IMAGES)
+
+
+@pytest.mark.parametrize("names", ["ab", "ba"])
+def test_an_image_of_several_datums_is_as_accurate_as_the_least_accurate_of_them(
+    names: str, tmp_path: Path
+) -> None:
+    """One on WGS 84, and one beside it on DHDN, whose operation has an accuracy of 2 m."""
+    for name, crs in zip(names, ("EPSG:31468", "EPSG:32633"), strict=True):
+        x, y = xy_of_lon_lat(crs, np.array([[12.6 if crs == "EPSG:31468" else 12.6005, 52.75]]))[0]
+        place = from_origin(x, y, 1.0, 1.0)
+        with rasterio.open(
+            tmp_path / f"{name}.tif", "w", "GTiff", 20, 20, 1, crs, place, "uint8"
+        ) as file:
+            file.write(np.full((1, 20, 20), 7, np.uint8))
+    assert mosaic_at(tmp_path).shift_sigma_m == 2.0

@@ -248,3 +248,15 @@ def test_columns_that_are_added_replace_those_in_capital_letters(tmp_path: Path)
     first = VectorLayer("a", layer().geometries, table, None)
     changed = first.changed(first.geometries, {"ce90_m": np.array([1.0, 2.0])}, None)
     assert changed.attributes.to_pydict() == {"ce90_m": [1.0, 2.0]}
+
+
+def test_features_that_are_taken_keep_their_numbers_attributes_and_reasons() -> None:
+    shapes = shapely.points(np.arange(5.0), 0.0)
+    table, numbers = pa.table({"name": list("abcde")}), np.array([10, 11, 12, 13, 14])
+    layer = VectorLayer("layer", shapes, table, "EPSG:4326", numbers, {1: "a curve", 4: "damaged"})
+    taken = layer.take(np.array([4, 0, 3]))
+    assert taken.fid is not None
+    assert taken.fid.tolist() == [14, 10, 13]
+    assert taken.attributes["name"].to_pylist() == ["e", "a", "d"]
+    assert shapely.get_x(taken.geometries).tolist() == [4.0, 0.0, 3.0]
+    assert taken.unusable == {0: "damaged"}

@@ -11,7 +11,7 @@ from amers.services.map_grid import MapGrid
 from amers.services.surface.difference import TwoSurfaces
 from amers.services.surface.pairs import Pair, candidate_pairs, choose_pairs
 from amers.services.surface.surface import SurfaceTile
-from amers.services.surface.tiles import coarser, part_of_grid, tiles_of, windows_of
+from amers.services.surface.tiles import coarser, grid_over, part_of_grid, tiles_of, windows_of
 from amers.services.types import Array, FloatImage
 from tests.services.surface.worlds import scene
 
@@ -66,6 +66,18 @@ def test_parts_of_a_grid_and_coarser_ones_lie_where_it_lies() -> None:
     assert coarse.shape == (225, 275)
     corner = np.array([[-0.5, -0.5]])
     np.testing.assert_allclose(coarse.xy(corner), GRID.xy(corner))
+
+
+@pytest.mark.parametrize("side_m", [0.5, 3.0])
+def test_the_grid_of_a_surface_holds_what_a_pair_shows_and_no_more(side_m: float) -> None:
+    scenes = [scene("left"), scene("right")]
+    pairs = candidate_pairs(scenes, (140.0, 180.0), (0.1, 0.9))
+    grid = grid_over(scenes, pairs, side_m)
+    at = grid.line_sample(pairs[0].overlap)
+    assert grid.contains(at).all()
+    room = np.array([at.min(axis=0) + 0.5, np.array(grid.shape) - 0.5 - at.max(axis=0)])
+    assert (room <= 1.0).all()
+    np.testing.assert_allclose(grid.origin_xy / side_m % 1.0, 0.5)
 
 
 def test_a_small_image_within_a_large_one_is_its_partner() -> None:
