@@ -32,7 +32,10 @@ MADE: Mapping[str, Callable[..., Any]] = {
     "replacing": lambda _folder: contextlib.nullcontext(Path()),
 }
 """Functions with a result of their own: one scene of two, an empty folder in place of one to write."""
-_CONVERTED = ("parse_", "printable", "by_", "checked_", "named_", "box_of", "stated_", "file_place")
+_CONVERTED = (
+    *("parse_", "printable", "by_", "checked_", "named_", "box_of", "stated_", "file_place"),
+    "parameter_names",
+)
 """How functions begin that only convert what is given: these are called."""
 
 

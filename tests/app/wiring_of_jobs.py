@@ -12,6 +12,7 @@ import re
 import sys
 import types
 import typing
+from base64 import b64encode
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import UTC, date, datetime
 from enum import Enum
@@ -26,7 +27,9 @@ import pytest
 from fastapi.params import Depends
 from fastapi.routing import APIRoute
 from pydantic import BaseModel
+from starlette.datastructures import Headers
 
+from amers.app.api.marks import AskedPlace
 from amers.app.main import ROUTERS
 from amers.app.usecases.jobs import PROCESSES
 from amers.app.usecases.processes import Process, Work
@@ -61,6 +64,11 @@ FORMS: Mapping[str, tuple[Any, Any]] = {
     "heights_m": ((17.0, 19.0), (18.0, 23.0)),
     "matrix_set": ("WebMercatorQuad", "OtherQuad"),
     "outputs": ({}, {}),
+    "places": ([AskedPlace(line=17, sample=19)], [AskedPlace(lon=18, lat=23)]),
+    "upload_checksum": (
+        f"sha1 {b64encode(bytes(20)).decode()}",
+        f"sha256 {b64encode(bytes(32)).decode()}",
+    ),
     "upload_metadata": ("filename dGV4dA==", "filename b3RoZXI="),
     "vectors": ("text.geojson", "other.geojson"),
 }
@@ -68,10 +76,13 @@ FORMS: Mapping[str, tuple[Any, Any]] = {
 APART: Mapping[str, tuple[str, ...]] = {
     "ingest-block": ("upload",),
     "make-mosaic": ("height_m",),
-    "GET /collections/points/chips": ("ids",),
-    "GET /search": ("query.bbox",),
+    "GET /collections/points/chips": ("query.ids",),
+    "POST /collections/points/chips": ("body.ids",),
+    "GET /search": ("query.bbox", "query.crs", "query.properties"),
 }
 """Inputs that others rule out, and that are not among all."""
+REQUEST: Mapping[str, Any] = {"headers": Headers(), "query_params": {"f": "json"}}
+"""What a request has besides the parameters that are named."""
 
 
 def interfaces() -> Iterator[tuple[str, Callable[[], Found]]]:
@@ -128,7 +139,7 @@ def of_endpoint(route: APIRoute) -> Found:
                 name, None if parameter.default is inspect.Parameter.empty else parameter.default
             )
             if name in own
-            else Anything(name=name)
+            else Anything(name=name, **(REQUEST if name == "request" else {}))
             for name, parameter in signature.parameters.items()
         }
         with _recorded(function.__module__) as recorders:
@@ -182,6 +193,9 @@ def _found(
     others = {
         name: _named_value(name, kind, number, 1) for number, (name, kind) in enumerate(own.items())
     }
+    for model, field in (name.split(".") for name in apart if "." in name and name not in own):
+        for given in (values, others):
+            object.__setattr__(given[model], field, None)
     beside = (
         {name: values[name] for name in values if name in least},
         {name: values[name] for name in values if name not in apart},
