@@ -60,14 +60,30 @@ UNORDERED = ("features", "scenes", "jobs")
 """Lists that may be in the order of ids, which are drawn."""
 ACROSS = "bbox=179,-18,-179,-16"
 TRIANGLE = [[5.2, 43.2], [5.3, 43.2], [5.25, 43.28], [5.2, 43.2]]
+MERCATOR = "http://www.opengis.net/def/crs/EPSG/0/3857"
 SEARCHES: tuple[dict[str, Any], ...] = (
     {"limit": 4},
     {"limit": 3, "bbox": [float(one) for one in MIDDLE.split(",")], "properties": "block_number"},
-    {"limit": 2, "crs": "http://www.opengis.net/def/crs/EPSG/0/3857", "filter": "sigma_up_m > 0.1"},
+    {"limit": 2, "crs": MERCATOR, "filter": "sigma_up_m > 0.1"},
     {"limit": 9, "intersects": {"type": "Polygon", "coordinates": [TRIANGLE]}, "properties": "n_views"},
     {"limit": 2, "bbox": [179.0, -18.0, -179.0, -16.0], "properties": "sigma_east_m,n_views"},
+    {"limit": 2, "sortby": "-sigma_up_m,saliency", "properties": "sigma_up_m,saliency", "f": "csv"},
+    {
+        "limit": 2,
+        "datetime": "../2017-06-01",
+        "filter": {"op": ">", "args": [{"property": "n_views"}, 1]},
+    },
 )
 """Bodies of searches for points."""
+SCENE_SEARCHES: tuple[dict[str, Any], ...] = (
+    {"limit": 1, "sortby": [{"field": "properties.gsd", "direction": "desc"}]},
+    {"limit": 1, "sortby": [{"field": "gsd", "direction": "asc"}], "bbox": [5.0, 43.0, 5.5, 43.3]},
+    {"datetime": "2018-01-01T00:00:00Z/..", "collections": ["scenes"]},
+    {"intersects": {"type": "Point", "coordinates": [5.35, 43.13]}},
+    {"collections": ["points"]},
+    {"filter": {"op": "=", "args": [{"property": "platform"}, "WV02"]}, "filter-lang": "cql2-json"},
+)
+"""Bodies of searches for scenes."""
 FILTERS = {
     "points": (
         "sigma_east_m<0.2",
@@ -114,6 +130,21 @@ OTHERS = (
     "/search?bbox=5.35,43.05,5.4,43.2",
     "/search?datetime=2018-01-01T00:00:00Z/..",
     "/collections/scenes/items?filter=gsd>1",
+    "/audit?limit=2&before=4",
+    *(f"/audit?limit=3&{one}" for one in ("kind=point", "subject=calanques@1", "actor=a client")),
+    *(f"/collections/points/items/{FIRST + 1}?{one}" for one in ("f=html", f"crs={MERCATOR}")),
+    *(f"/collections/points/items/{FIRST + 1}/chips{one}" for one in ("?f=png", "/1?f=tif", "/2")),
+    "/collections/points/items?limit=3&f=html&" + ACROSS,
+    "/collections/blocks/items?limit=9&f=html",
+    "/collections/scenes/items?limit=9&f=html&sortby=gsd&properties=gsd,platform",
+    *(f"/collections/{name}?f=html" for name in ("blocks", "scenes")),
+    f"/collections/points/items?limit=3&bbox={WEST},{SOUTH},100,{EAST},{NORTH},120",
+    f"/collections/points/items?limit=3&bbox-crs={MERCATOR}&bbox=581000,5344000,584000,5349000",
+    "/collections/points/items?limit=3&n_views=2&sortby=sigma_east_m&properties=sigma_east_m",
+    "/collections/points/items?limit=2500&properties=n_views",
+    *(f"/search?limit=1&sortby={one}" for one in ("gsd", "-gsd")),
+    "/jobs?datetime=../2020-01-01",
+    "/jobs?status=successful&minDuration=0&maxDuration=100000",
 )
 _ID = re.compile(r"[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}")
 _OF_THIS_RUN = re.compile(
@@ -241,13 +272,18 @@ def answers(world: HttpWorld, reader: Mapping[str, str]) -> Mapping[str, dict[st
         as_reader = told(world.client.get(address, headers=reader), names)
         if as_reader != found[name]:
             found[f"{name} as a reader"] = as_reader
-    for number, body in enumerate(SEARCHES):
-        reply = world.client.post("/collections/points/search", json=body)
-        found[f"search {number}"] = told(reply, names)
-        following = [one for one in reply.json().get("links", []) if one["rel"] == "next"]
-        for one in following:
-            again = world.client.request(one.get("method", "GET"), one["href"], json=one.get("body"))
-            found[f"search {number}, second page"] = told(again, names)
+    searches = (
+        ("search", "/collections/points/search", SEARCHES),
+        ("scenes", "/search", SCENE_SEARCHES),
+    )
+    for name, path, bodies in searches:
+        for number, body in enumerate(bodies):
+            reply = world.client.post(path, json=body)
+            found[f"{name} {number}"] = told(reply, names)
+            links = reply.json().get("links", []) if "json" in reply.headers["content-type"] else []
+            for one in (one for one in links if one["rel"] == "next"):
+                again = world.client.request(one.get("method", "GET"), one["href"], json=one.get("body"))
+                found[f"{name} {number}, second page"] = told(again, names)
     return found
 
 
