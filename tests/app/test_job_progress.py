@@ -4,8 +4,6 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 from uuid import UUID, uuid4
 
-from fastapi.testclient import TestClient
-
 from amers.app.config import Settings
 from amers.app.db.audit import list_changes
 from amers.app.db.engine import Connection, Database
@@ -106,8 +104,8 @@ def test_a_waiting_job_is_expected_after_those_before_it_shared_by_the_workers(c
     assert abs(wait_of(connection, waiting) - timedelta(seconds=100 + 20 + 100)) < a_slow_machine
     run_sql(
         connection,
-        "insert into procrastinate_workers (last_heartbeat) values (now()), (now()),"
-        " (now() - interval '1 hour')",
+        "insert into procrastinate_workers (last_heartbeat) values (now()), (now() - interval '20 s'),"
+        " (now() - interval '1 minute')",
     )
     assert abs(wait_of(connection, waiting) - timedelta(seconds=(100 + 20) / 2 + 100)) < a_slow_machine
     ended = jobs.find(connection, done_in(connection, 1))
@@ -192,15 +190,15 @@ def test_jobs_of_one_transaction_wait_in_the_order_of_the_queue(connection: Conn
 
 
 def test_old_results_are_removed_and_the_job_reports_it(
-    client: TestClient, bearer, database: Database, storage: Storage, settings: Settings
+    bearer, database: Database, storage: Storage, settings: Settings
 ):
     me, admin = bearer("register"), bearer("admin")
-    scene = client.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100), headers=me).json()["id"]
+    scene = me.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100)).json()["id"]
     body = {"inputs": {"scene": scene}}
     urls = []
     with database.transaction() as connection:
         for age_days in (3.0, 1.0):
-            reply = client.post("/processes/register-scene/execution", json=body, headers=me)
+            reply = me.post("/processes/register-scene/execution", json=body)
             url = reply.headers["location"]
             job = claim(connection, UUID(url.rsplit("/", 1)[1]), "w", LEASE_S)
             assert job is not None
@@ -224,17 +222,15 @@ def test_old_results_are_removed_and_the_job_reports_it(
         sweep_records(database, storage, kept_for_two_days)
     old, young = urls
     assert storage.keys("results") == [f"results/{young.rsplit('/', 1)[1]}/1/report.json"]
-    document = client.get(old, headers=me).json()
+    document = me.get(old).json()
     assert document["status"] == "successful"
     assert not any(link["rel"].endswith("/results") for link in document["links"])
-    gone = client.get(f"{old}/results", headers=me)
+    gone = me.get(f"{old}/results")
     assert gone.status_code == 410
     assert "removed on" in gone.json()["detail"]
-    assert client.get(f"{old}/results/report.json", headers=me).status_code == 404
-    assert client.get(f"{young}/results/report.json", headers=me).content == b"{}"
+    assert me.get(f"{old}/results/report.json").status_code == 404
+    assert me.get(f"{young}/results/report.json").content == b"{}"
     with database.transaction() as connection:
         changes = list_changes(connection, 1000, None, "job", old.rsplit("/", 1)[1])
     assert (changes[0].actor_name, changes[0].action) == ("retention", "changed")
-    assert client.get("/audit?kind=job", headers=admin).json()["changes"][0]["after"][
-        "results_removed_at"
-    ]
+    assert admin.get("/audit?kind=job").json()["changes"][0]["after"]["results_removed_at"]
