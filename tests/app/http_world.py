@@ -16,10 +16,10 @@ from amers.app.config import Settings
 from amers.app.db import engine
 from amers.app.main import create_app
 from amers.app.storage import Storage
-from amers.app.usecases.blocks import lifecycle
 from amers.app.usecases.jobs import do_attempt
 from amers.app.usecases.tokens import create_token
 from tests.app.job_queue import claim
+from tests.app.served import serve_block
 from tests.factories import BOX, make_block
 
 SITE = "https://viewer.example"
@@ -96,8 +96,7 @@ def http_world(dsn: str, folder: Path) -> Iterator[HttpWorld]:
     with engine.connect(dsn) as connection:
         made = make_block(folder / "block", 30)
         storage = Storage(settings.data_folder / "storage")
-        lifecycle.ingest_block(connection, storage, made.folder)
-        lifecycle.publish_block(connection, "calanques")
+        serve_block(connection, storage, made.folder)
         token = create_token(connection, "a client", ["admin"])
     app = create_app(settings)
     with TestClient(app, raise_server_exceptions=False, follow_redirects=False) as client:

@@ -18,7 +18,7 @@ from amers.app.storage import Storage
 from tests.app.callers import Caller
 from tests.app.flat_world import FlatWorld
 from tests.app.worker_processes import attempts_of, ended, running_worker, scene_to_register, under_way
-from tests.statements import run_sql
+from tests.statements import run_in
 
 Ask = Callable[[int], str]
 Worker = AbstractContextManager["subprocess.Popen[bytes]"]
@@ -72,8 +72,7 @@ class Installation:
     def results(self, job: str) -> int:
         """The number of registrations of a job."""
         count = "select count(*) as n from registration where job_id = %s"
-        with engine.connect(self.dsn) as connection:
-            (row,) = run_sql(connection, count, [job.rsplit("/", 1)[-1]]).fetchall()
+        (row,) = run_in(engine.connect(self.dsn), count, [job.rsplit("/", 1)[-1]])
         return int(row["n"])
 
     def outcome(self, job: dict[str, Any]) -> tuple[str, int, int]:

@@ -7,17 +7,24 @@ from amers.app.db import registrations
 from amers.app.db.engine import Connection, Database
 from amers.app.db.jobs import attempts, jobs
 from amers.app.db.jobs.jobs import Job
-from tests.statements import run_sql
+from tests.statements import run_in, run_sql
 
 LEASE_S = 30.0
+
+
+def requested(
+    connection: Connection, kind: str, inputs: dict[str, Any], *of: UUID | None, **more: Any
+) -> Job:
+    """A job as it is requested, under a key that nobody has used."""
+    job = jobs.create(connection, kind, inputs, *of, **more)
+    assert job is not None
+    return job
 
 
 def new_job(database: Database) -> Job:
     """An accepted job."""
     with database.transaction() as connection:
-        job = jobs.create(connection, "register-scene", {"scene": str(uuid4())})
-    assert job is not None
-    return job
+        return requested(connection, "register-scene", {"scene": str(uuid4())})
 
 
 def claim(
@@ -57,12 +64,11 @@ def store_registration(connection: Connection, **stated: Any) -> UUID:
 
 def let_lease_lapse(database: Database, job_id: UUID) -> None:
     """Let the lease of the job expire."""
-    with database.transaction() as connection:
-        run_sql(
-            connection,
-            "update job set lease_until = now() - interval '1 second' where id = %s",
-            [job_id],
-        )
+    run_in(
+        database.transaction(),
+        "update job set lease_until = now() - interval '1 second' where id = %s",
+        [job_id],
+    )
 
 
 def tickets(connection: Connection) -> int:

@@ -14,10 +14,10 @@ from amers.app.config import Settings
 from amers.app.db import engine
 from amers.app.db.cluster.embedded import Cluster
 from amers.app.storage import Storage
-from amers.app.usecases.blocks import lifecycle
 from amers.app.usecases.tokens import create_token
 from amers.services.types import ControlPoints
 from tests.app.conftest import TEMPLATE, fresh_database
+from tests.app.served import serve_block
 from tests.app.worker_processes import children, wait_until
 from tests.command_line import environment_of
 from tests.factories import MadeBlock, make_block
@@ -58,8 +58,7 @@ def service_with_a_block(
         made = made or make_block(folder / "block", count=60)
         settings = Settings(database_url=dsn, data_folder=folder / "data")
         with engine.connect(dsn) as connection:
-            lifecycle.ingest_block(connection, Storage(settings.data_folder / "storage"), made.folder)
-            lifecycle.publish_block(connection, "calanques")
+            serve_block(connection, Storage(settings.data_folder / "storage"), made.folder)
             secret = create_token(connection, "a client", [scope]).secret
         port = free_port()
         environment = {

@@ -19,7 +19,6 @@ from amers.app.db.features.crs import EPSG_3857
 from amers.app.db.points import control_points
 from amers.app.db.scenes import set_footprint
 from amers.app.storage import Storage
-from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
 from amers.app.usecases.image_production import ProductionImages, run_image_production
 from amers.app.usecases.new_block import BlockIdentity
 from amers.app.usecases.registration.control_sources import points_of_store
@@ -30,6 +29,7 @@ from amers.services.imagery.scene import scene_footprint
 from amers.services.production.image_production import ProductionOptions
 from amers.services.simulation.view import SimulatedView, ViewPlan, simulate_block, simulate_view
 from amers.services.simulation.world import World, make_world
+from tests.app.served import serve_block
 
 pytestmark = pytest.mark.long
 
@@ -91,8 +91,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 @pytest.fixture
 def published(made: Made, dsn: str, storage: Storage) -> None:
     with engine.connect(dsn) as connection:
-        block = ingest_block(connection, storage, made.block).block
-        publish_block(connection, str(block.number))
+        serve_block(connection, storage, made.block)
 
 
 def test_points_of_both_sides_are_made_and_spread_as_anywhere(made: Made) -> None:
@@ -117,9 +116,7 @@ def test_a_footprint_finds_the_points_of_both_sides(made: Made, published: None,
     assert (found.lon_lat_h[:, 0] < 0.0).any()
 
 
-def test_boxes_find_what_lies_on_their_side(
-    made: Made, published: None, client: TestClient, bearer
-) -> None:
+def test_boxes_find_what_lies_on_their_side(made: Made, published: None, bearer) -> None:
     lon = check_block(made.block).points.lon_lat_h[:, 0]
     for box, sides in [
         ("179.9,-17.1,-179.9,-16.9", 2),
@@ -127,10 +124,10 @@ def test_boxes_find_what_lies_on_their_side(
         ("-180,-17.1,-179.9,-16.9", 1),
     ]:
         asked = f"items?bbox={box}&limit=1000"
-        points = client.get(f"/collections/points/{asked}", headers=bearer("read")).json()
+        points = bearer("read").get(f"/collections/points/{asked}").json()
         expected = len(lon) if sides == 2 else int(((lon > 0.0) == box.endswith(",180,-16.9")).sum())
         assert points["numberReturned"] == expected, box
-        blocks = client.get(f"/collections/blocks/{asked}", headers=bearer("admin")).json()
+        blocks = bearer("admin").get(f"/collections/blocks/{asked}").json()
         assert blocks["numberReturned"] == 1, box
 
 
@@ -155,10 +152,8 @@ def test_an_outline_across_is_two_counterclockwise_parts(
 
 
 @pytest.mark.parametrize("form", ["parquet", "fgb", "gpkg"])
-def test_files_hold_both_parts(
-    published: None, client: TestClient, bearer, tmp_path: Path, form: str
-) -> None:
-    reply = client.get(f"/collections/blocks/items?f={form}", headers=bearer("read"))
+def test_files_hold_both_parts(published: None, bearer, tmp_path: Path, form: str) -> None:
+    reply = bearer("read").get(f"/collections/blocks/items?f={form}")
     path = tmp_path / f"blocks.{form}"
     path.write_bytes(reply.content)
     read = geopandas.read_parquet(path) if form == "parquet" else geopandas.read_file(path)
@@ -167,9 +162,9 @@ def test_files_hold_both_parts(
 
 
 @pytest.mark.parametrize("x", [0, 255], ids=["west of America", "east of Asia"])
-def test_tiles_of_both_sides_show_the_block(published: None, client: TestClient, bearer, x: int) -> None:
+def test_tiles_of_both_sides_show_the_block(published: None, bearer, x: int) -> None:
     row = int((1.0 - np.arcsinh(np.tan(np.radians(CENTRE[1]))) / np.pi) / 2.0 * 256)
-    tile = client.get(f"/collections/blocks/tiles/WebMercatorQuad/8/{row}/{x}", headers=bearer("read"))
+    tile = bearer("read").get(f"/collections/blocks/tiles/WebMercatorQuad/8/{row}/{x}")
     assert b"dateline" in tile.content
 
 
@@ -194,13 +189,13 @@ def test_geometries_of_queries_intersect_features_on_either_side(
     )
     for question in questions:
         asked = {**question, "limit": 1000}
-        points = client.post("/collections/points/search", json=asked, headers=bearer("read")).json()
+        points = bearer("read").post("/collections/points/search", json=asked).json()
         assert points["numberReturned"] == inside.sum()
         assert len(outlines_of(client, bearer("read"), "POST", **question)) == 1
 
 
 def test_a_geometry_in_metres_goes_on_beyond_the_edge_of_the_map(
-    made: Made, published: None, client: TestClient, bearer
+    made: Made, published: None, bearer
 ) -> None:
     east, north = 20_037_508.342789244, -1_920_000.0
     ring = [(east + x, north + y) for x, y in [(-9e4, -9e4), (9e4, -9e4), (9e4, 9e4), (-9e4, 9e4)]]
@@ -210,7 +205,7 @@ def test_a_geometry_in_metres_goes_on_beyond_the_edge_of_the_map(
         "filter-crs": EPSG_3857.uri,
         "limit": 1000,
     }
-    page = client.post("/collections/points/search", json=question, headers=bearer("read")).json()
+    page = bearer("read").post("/collections/points/search", json=question).json()
     assert page["numberReturned"] == len(check_block(made.block).points)
 
 
@@ -224,27 +219,27 @@ def test_a_geometry_in_metres_goes_on_beyond_the_edge_of_the_map(
     ids=["crosses itself", "too far", "no geometry"],
 )
 def test_a_geometry_that_cannot_be_used_is_refused_by_the_name_it_came_under(
-    client: TestClient, bearer, wrong: dict[str, Any]
+    bearer, wrong: dict[str, Any]
 ) -> None:
     meets = {"op": "s_intersects", "args": [{"property": "geometry"}, wrong]}
     for name, value in (("intersects", wrong), ("filter", meets)):
-        reply = client.post("/collections/points/search", json={name: value}, headers=bearer("read"))
+        reply = bearer("read").post("/collections/points/search", json={name: value})
         assert reply.status_code == 400
         assert reply.json()["detail"].startswith(f"{name}: ")
 
 
 def test_a_scene_across_is_a_stac_item_whose_box_begins_in_the_east(
-    client: TestClient, bearer, made: Made, dsn: str
+    bearer, made: Made, dsn: str
 ) -> None:
-    headers = bearer("register")
-    sent = client.post("/scenes?name=a.tif", content=made.scene.read_bytes(), headers=headers).json()
+    caller = bearer("register")
+    sent = caller.post("/scenes?name=a.tif", content=made.scene.read_bytes()).json()
     outline = np.array([(179.5, -17.0), (180.5, -17.0), (180.5, -16.0), (179.5, -16.0)])
     with engine.connect(dsn) as connection:
         set_footprint(connection, UUID(sent["id"]), outline)
-    item = client.get(f"/collections/scenes/items/{sent['id']}", headers=headers).json()
+    item = caller.get(f"/collections/scenes/items/{sent['id']}").json()
     assert item["geometry"]["type"] == "MultiPolygon"
     assert item["bbox"] == [179.5, -17.0, -179.5, -16.0]
-    document = client.get("/search?bbox=-180,-17,-179.9,-16", headers=headers).json()
+    document = caller.get("/search?bbox=-180,-17,-179.9,-16").json()
     assert [one["id"] for one in document["features"]] == [sent["id"]]
 
 

@@ -20,7 +20,7 @@ from amers.app.errors import (
 from amers.app.main import create_app
 from amers.app.usecases.tokens import create_token, list_tokens
 from amers.services.errors import NotEnoughPoints
-from tests.statements import run_sql
+from tests.statements import run_in, run_sql
 
 SCOPES = {"read": Reader, "register": Registrar, "admin": Admin}
 
@@ -84,9 +84,9 @@ def refused(reply, status: int) -> dict:
 
 
 def test_every_link_of_the_landing_page_works(client, bearer):
-    page, headers = client.get("/").json(), bearer("register")
+    page, caller = client.get("/").json(), bearer("register")
     for link in page["links"]:
-        assert client.get(link["href"], headers=headers).status_code == 200, link
+        assert caller.get(link["href"]).status_code == 200, link
 
 
 def test_a_ready_service_has_a_database_that_answers(client):
@@ -97,10 +97,10 @@ def test_a_ready_service_has_a_database_that_answers(client):
 
 def test_connections_that_the_database_has_closed_are_replaced_before_use(client, dsn):
     ours = "datname = current_database() and usename = current_user and pid <> pg_backend_pid()"
-    with engine.connect(dsn) as connection:
-        run_sql(
-            connection, f"select pg_terminate_backend(pid, 10000) from pg_stat_activity where {ours}"
-        )
+    run_in(
+        engine.connect(dsn),
+        f"select pg_terminate_backend(pid, 10000) from pg_stat_activity where {ours}",
+    )
     for _ in range(5):
         assert client.get("/conformance").status_code == client.get("/readyz").status_code == 200
 
@@ -135,7 +135,7 @@ def test_every_form_of_a_page_sends_a_request_that_the_service_answers(client, b
         choices = {field.name: [value for value, _ in field.choices] for field in form.fields}
         asked = {field.name: field.value for field in form.fields}
         for kind in choices["f"]:
-            tried = client.get(f"/{form.path}", params=asked | {"f": kind}, headers=bearer("read"))
+            tried = bearer("read").get(f"/{form.path}", params=asked | {"f": kind})
             assert tried.status_code == 200, (form.id, kind, tried.text)
 
 
@@ -162,10 +162,10 @@ def test_an_invalid_token_is_refused_and_never_treated_as_no_token(client, setti
         ("admin", {*SCOPES, "points"}),
     ],
 )
-def test_a_token_opens_the_endpoints_of_its_scope(client, bearer, scope, opened):
-    headers = bearer(scope)
+def test_a_token_opens_the_endpoints_of_its_scope(bearer, scope, opened):
+    caller = bearer(scope)
     for name in (*SCOPES, "points"):
-        reply = client.get(f"/scope/{name}", headers=headers)
+        reply = caller.get(f"/scope/{name}")
         if name in opened:
             assert reply.json() == f"a token to {scope}"
         else:

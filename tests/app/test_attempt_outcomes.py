@@ -18,7 +18,7 @@ from amers.app.worker import attempt
 from amers.app.worker.attempt import ATTEMPTS_ALLOWED, Attempts
 from amers.app.worker.limits import NO_ROOM, OUT_OF_MEMORY
 from tests.app.job_queue import new_job, state_of
-from tests.statements import run_sql
+from tests.statements import run_in
 
 FILE_TOO_LARGE = -signal.SIGXFSZ
 CRASH = -signal.SIGSEGV
@@ -71,8 +71,7 @@ class Worker:
 
     def attempt_ends(self, code: int | None, *, stops: bool = False) -> Job:
         """The job after an attempt that is due at once."""
-        with self.database.transaction() as connection:
-            run_sql(connection, "update job set not_before = null")
+        run_in(self.database.transaction(), "update job set not_before = null")
         return self.attempt_of(Processes(code, self.storage), stops=stops)
 
     def attempt_of(self, processes: Processes, *, stops: bool = False) -> Job:
@@ -149,8 +148,7 @@ def test_a_disk_that_is_full_ends_a_job_at_last_and_a_disk_that_is_away_does_not
             raise error
 
     for expected in failures:
-        with worker.database.transaction() as connection:
-            run_sql(connection, "update job set not_before = null")
+        run_in(worker.database.transaction(), "update job set not_before = null")
         job = worker.attempt_of(Failing(None, worker.storage))
         if expected is None:
             assert job.error is not None
@@ -180,11 +178,10 @@ def test_a_job_whose_process_is_killed_every_time_ends(worker: Worker):
 def test_the_pause_before_the_next_attempt_grows_with_the_failures(worker: Worker):
     for failures in (1, 2):
         worker.attempt_ends(CRASH)
-        with worker.database.transaction() as connection:
-            row = run_sql(
-                connection, "select extract(epoch from not_before - updated_at) as pause_s from job"
-            ).fetchone()
-        assert row is not None
+        (row,) = run_in(
+            worker.database.transaction(),
+            "select extract(epoch from not_before - updated_at) as pause_s from job",
+        )
         assert float(row["pause_s"]) == pytest.approx(LEASE_S * failures, abs=1.0)
 
 
@@ -222,8 +219,7 @@ def test_a_dismissed_job_is_noticed_long_before_its_lease_is_due(
 
 
 def test_a_worker_whose_database_was_upgraded_claims_nothing(worker: Worker):
-    with worker.database.transaction() as connection:
-        run_sql(connection, "update alembic_version set version_num = '9999'")
+    run_in(worker.database.transaction(), "update alembic_version set version_num = '9999'")
     with pytest.raises(InputError, match="restart it"):
         Attempts(
             worker.database,
@@ -241,6 +237,5 @@ def test_the_cpu_of_an_attempt_counts_for_its_owner_however_it_ends(worker: Work
     worker.settings = worker.settings.model_copy(update={"job_seconds": 0.1})
     processes = Processes(code, worker.storage, cpu_s=50.0)
     worker.attempt_of(processes)
-    with worker.database.transaction() as connection:
-        rows = run_sql(connection, "select cpu_s from job_turn").fetchall()
+    rows = run_in(worker.database.transaction(), "select cpu_s from job_turn")
     assert [row["cpu_s"] for row in rows] == [50.0]

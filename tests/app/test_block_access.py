@@ -43,17 +43,16 @@ def archive_of(folder: Path, kind: str) -> bytes:
 
 @pytest.mark.parametrize("kind", ["zip", "tar"])
 def test_a_block_is_uploaded_as_an_archive_and_ingested_by_a_job(
-    client, settings, bearer, tmp_path, kind
+    client, settings, bearer, tmp_path, kind, admin
 ):
     made = make_block(tmp_path / "calanques_v1")
-    admin = bearer("admin")
     path = f"/blocks/uploads/calanques.{kind}"
-    assert client.put(path, content=b"x", headers=bearer("register")).status_code == 403
-    reply = client.put(path, content=archive_of(made.folder, kind), headers=admin)
+    assert bearer("register").put(path, content=b"x").status_code == 403
+    reply = admin.put(path, content=archive_of(made.folder, kind))
     assert reply.status_code == 201, reply.text
     job = ingested_by_job(client, settings, admin, {**reply.json(), "publish": True, "priority": 2})
     assert job["status"] == "successful", job
-    (feature,) = client.get("/collections/blocks/items", headers=admin).json()["features"]
+    (feature,) = admin.get("/collections/blocks/items").json()["features"]
     assert feature["properties"]["state"] == "published"
     assert feature["properties"]["n_points"] == 40
 
@@ -67,15 +66,13 @@ def test_the_problems_of_a_refused_block_are_listed_with_their_reasons(
         chips.write(b"\x01\x02")
     (made.folder / "stray.txt").write_text("not listed")
     admin = bearer("admin")
-    upload = client.put(
-        "/blocks/uploads/b.zip", content=archive_of(made.folder, "zip"), headers=admin
-    ).json()
+    upload = admin.put("/blocks/uploads/b.zip", content=archive_of(made.folder, "zip")).json()
     job = ingested_by_job(client, settings, admin, upload)
     assert job["status"] == "failed"
     problems = job["error"]["problems"]
     assert {problem["file"] for problem in problems} == {"chips/0000.npy", "stray.txt"}
     assert all(problem["found"] and problem["expected"] for problem in problems)
-    assert client.get("/collections/blocks/items", headers=admin).json()["features"] == []
+    assert admin.get("/collections/blocks/items").json()["features"] == []
 
 
 def hostile_zip(path: Path, name: str) -> bytes:
@@ -90,23 +87,22 @@ def hostile_zip(path: Path, name: str) -> bytes:
     [("../../etc/x", "etc/x"), ("/etc/x", "etc/x"), ("elsewhere/x", "outside the folder")],
 )
 def test_an_archive_that_reaches_out_of_its_folder_is_refused(
-    client, settings, bearer, tmp_path, name, expected_message
+    client, settings, admin, tmp_path, name, expected_message
 ):
-    admin = bearer("admin")
     content = hostile_zip(tmp_path / "bad.zip", name)
-    upload = client.put("/blocks/uploads/bad.zip", content=content, headers=admin).json()
+    upload = admin.put("/blocks/uploads/bad.zip", content=content).json()
     job = ingested_by_job(client, settings, admin, upload)
     assert job["status"] == "failed"
     assert expected_message in job["message"]
 
 
 @pytest.mark.parametrize("body", [{}, {"path": "a", "upload": str(UUID(int=1))}, {"folder": "a"}])
-def test_an_ingestion_names_either_a_folder_or_an_upload(client, bearer, body):
-    assert client.post("/blocks", json=body, headers=bearer("admin")).status_code == 422
+def test_an_ingestion_names_either_a_folder_or_an_upload(bearer, body):
+    assert bearer("admin").post("/blocks", json=body).status_code == 422
 
 
-def test_an_upload_that_is_not_there_is_not_ingested(client, bearer):
-    reply = client.post("/blocks", json={"upload": str(UUID(int=1))}, headers=bearer("admin"))
+def test_an_upload_that_is_not_there_is_not_ingested(bearer):
+    reply = bearer("admin").post("/blocks", json={"upload": str(UUID(int=1))})
     assert reply.status_code == 404
 
 

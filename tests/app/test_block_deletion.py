@@ -9,7 +9,6 @@ from threading import Event
 from uuid import UUID, uuid4
 
 import pytest
-from fastapi.testclient import TestClient
 
 from amers.app.config import Settings
 from amers.app.db import engine, history
@@ -282,17 +281,17 @@ def test_the_version_is_ingested_again_after_its_deletion(
 
 
 def test_an_administrator_deletes_a_block_over_the_api_and_the_audit_trail_names_him(
-    client: TestClient, installation: Installation, withdrawn: MadeBlock, bearer: Callable[[str], dict]
+    installation: Installation, withdrawn: MadeBlock, bearer: Callable[[str], dict]
 ):
     administrator = bearer("admin")
-    assert client.delete("/blocks/calanques@1", headers=bearer("register")).status_code == 403
-    reply = client.delete("/blocks/calanques@1", headers=administrator)
+    assert bearer("register").delete("/blocks/calanques@1").status_code == 403
+    reply = administrator.delete("/blocks/calanques@1")
     assert reply.status_code == 200, reply.text
     assert reply.json()["block"]["state"] == "withdrawn"
     assert reply.json()["n_files"] > 0
-    assert client.get("/collections/blocks/items/1", headers=administrator).status_code == 404
-    assert client.delete("/blocks/calanques@1", headers=administrator).status_code == 404
+    assert administrator.get("/collections/blocks/items/1").status_code == 404
+    assert administrator.delete("/blocks/calanques@1").status_code == 404
     query = "/audit?kind=block&subject=calanques@1&limit=1"
-    [change] = client.get(query, headers=administrator).json()["changes"]
+    [change] = administrator.get(query).json()["changes"]
     assert (change["action"], change["actor_name"]) == ("deleted", "a token to admin")
     assert change["before"]["n_points"] == points_of_a_block

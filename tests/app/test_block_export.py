@@ -25,6 +25,7 @@ from amers.services.formats.block.document import rectangle
 from amers.services.formats.block.writer import write_block
 from amers.services.types import Frame, point_chips
 from tests.app.job_queue import claim, claimed, new_job
+from tests.app.served import serve_block
 from tests.factories import BOX, MadeBlock, control_points, make_block, metadata, noise_chips
 from tests.statements import run_sql
 
@@ -47,8 +48,7 @@ def publish(connection, storage, tmp_path):
 
     def publish(count: int = 5, name: str = "calanques", **of_block: Any) -> MadeBlock:
         made = make_block(tmp_path / name, count, name=name, **of_block)
-        lifecycle.ingest_block(connection, storage, made.folder)
-        lifecycle.publish_block(connection, name)
+        serve_block(connection, storage, made.folder)
         connection.commit()
         return made
 
@@ -163,8 +163,7 @@ def side_by_side(connection, storage, tmp_path):
             document = replace(metadata(name, box=box), **stated[name])
             contents = control_points(5, np.random.default_rng(7), box, n_images[name])
             write_block(tmp_path / name, document, contents, noise_chips(contents), {})
-            lifecycle.ingest_block(connection, storage, tmp_path / name)
-            lifecycle.publish_block(connection, name)
+            serve_block(connection, storage, tmp_path / name)
 
     return publish
 
@@ -223,19 +222,17 @@ def test_no_transaction_is_open_while_an_export_writes_files(publish, database, 
     assert set(open_transactions) == {0}
 
 
-def test_a_block_is_exported_by_a_job_as_an_archive(client, settings, publish, bearer, tmp_path):
+def test_a_block_is_exported_by_a_job_as_an_archive(settings, publish, bearer, tmp_path):
     publish()
     reader = bearer("read")
-    response = client.post(
-        "/processes/export-block/execution", json={"inputs": {"bbox": list(BOX)}}, headers=reader
-    )
+    response = reader.execute("export-block", {"bbox": list(BOX)})
     assert response.status_code == 201, response.text
     job_id = UUID(response.json()["jobID"])
     with engine.opened(settings) as database:
         with database.transaction() as own:
             job = claim(own, job_id, "a worker", 30.0)
         do_attempt(database, settings, job_id, job.attempt)
-    reply = client.get(f"/jobs/{job_id}/results/block.zip", headers=reader)
+    reply = reader.get(f"/jobs/{job_id}/results/block.zip")
     assert reply.status_code == 200, reply.text
     (tmp_path / "block.zip").write_bytes(reply.content)
     zipfile.ZipFile(tmp_path / "block.zip").extractall(tmp_path / "out")

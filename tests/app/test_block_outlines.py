@@ -14,10 +14,10 @@ from sqlalchemy import text
 from amers.app.db.blocks import ID_BITS, Block
 from amers.app.db.engine import Connection
 from amers.app.storage import Storage
-from amers.app.usecases.blocks import lifecycle
 from amers.app.usecases.blocks.lookup import block_extent
 from amers.services.formats.block.writer import write_block
 from amers.services.types import Array
+from tests.app.served import serve_block
 from tests.factories import affine_model, control_points, metadata, noise_chips
 from tests.statements import run_sql
 
@@ -56,8 +56,7 @@ def ingest(connection: Connection, storage: Storage, tmp_path: Path) -> Ingest:
         models = {"IMG_00": affine_model(described.extent.mean(axis=0))}
         folder = tmp_path / f"block-{version}"
         write_block(folder, described, points, noise_chips(points), models)
-        block = lifecycle.ingest_block(connection, storage, folder).block
-        lifecycle.publish_block(connection, str(block.number))
+        block = serve_block(connection, storage, folder)
         connection.commit()
         return block
 
@@ -69,7 +68,7 @@ def outline(client, bearer) -> Callable[[], shapely.Geometry]:
     """The outline of the only block, as the map page gets it."""
 
     def read() -> shapely.Geometry:
-        (feature,) = client.get("/collections/blocks/items", headers=bearer("read")).json()["features"]
+        (feature,) = bearer("read").get("/collections/blocks/items").json()["features"]
         return shapely.from_geojson(json.dumps(feature["geometry"]))
 
     return read
@@ -79,9 +78,7 @@ def in_unit_square(shape: shapely.Geometry, west: float = 5.2, south: float = 43
     return shapely.transform(shape, lambda lon_lat: (lon_lat - [west, south]) / SIDE_DEG)
 
 
-def test_the_outline_of_a_corner_leaves_out_the_ground_that_has_no_points(
-    ingest, outline, client, bearer
-):
+def test_the_outline_of_a_corner_leaves_out_the_ground_that_has_no_points(ingest, outline, bearer):
     positions = spread(CORNER)
     block = ingest(positions)
     drawn = in_unit_square(outline())
@@ -90,10 +87,10 @@ def test_the_outline_of_a_corner_leaves_out_the_ground_that_has_no_points(
     assert not shapely.contains_xy(drawn, 0.75, 0.75)
     assert shapely.area(shapely.symmetric_difference(drawn, CORNER)) < 0.15 * CORNER.area
     assert block_extent(block) == pytest.approx((5.2, 43.2, 5.3, 43.3))
-    single = client.get(f"/collections/blocks/items/{block.number}", headers=bearer("read")).json()
+    single = bearer("read").get(f"/collections/blocks/items/{block.number}").json()
     assert in_unit_square(shapely.from_geojson(json.dumps(single["geometry"]))).equals(drawn)
     box = f"{5.2 + 0.07},{43.2 + 0.07},{5.2 + 0.08},{43.2 + 0.08}"
-    beside = client.get(f"/collections/blocks/items?bbox={box}", headers=bearer("read")).json()
+    beside = bearer("read").get(f"/collections/blocks/items?bbox={box}").json()
     assert beside["features"] == []
 
 

@@ -18,6 +18,7 @@ from amers.app.usecases.blocks.listing import list_blocks
 from amers.app.usecases.garbage_collection import Bin, remove_unnamed_chips
 from amers.services.formats.block.document import rectangle
 from amers.services.types import point_chips
+from tests.app.served import serve_block
 from tests.factories import BOX, make_block
 
 float32_rounding = 1e-6
@@ -139,8 +140,7 @@ def test_the_store_mixes_blocks_without_mixing_their_images_and_chips(connection
         ),
     ]
     for block in made:
-        lifecycle.ingest_block(connection, storage, block.folder)
-        lifecycle.publish_block(connection, block.metadata.id)
+        serve_block(connection, storage, block.folder)
 
     points = point_store.control_points(connection, made[0].metadata.extent).points
 
@@ -159,8 +159,7 @@ def test_the_store_mixes_blocks_without_mixing_their_images_and_chips(connection
 
 def test_points_are_read_by_outline_and_thinned_evenly(connection, storage, tmp_path):
     made = make_block(tmp_path / "many", count=600)
-    lifecycle.ingest_block(connection, storage, made.folder)
-    lifecycle.publish_block(connection, "calanques")
+    serve_block(connection, storage, made.folder)
     triangle = np.array([[BOX[0], BOX[1]], [BOX[2], BOX[1]], [BOX[0], BOX[3]]])
     inside = (made.points.lon_lat_h[:, :2] - [BOX[0], BOX[1]]).sum(axis=1) < 0.1
 
@@ -183,8 +182,7 @@ def test_no_published_points_is_an_empty_answer(connection, ingested):
 
 def test_an_outline_across_the_antimeridian_finds_both_sides(connection, storage, tmp_path):
     made = make_block(tmp_path / "far", count=30, box=(179.9, -17.0, -179.9, -16.9))
-    lifecycle.ingest_block(connection, storage, made.folder)
-    lifecycle.publish_block(connection, "calanques")
+    serve_block(connection, storage, made.folder)
     east = point_store.control_points(connection, made.metadata.extent)
     west = point_store.control_points(connection, made.metadata.extent - [360.0, 0.0])
     assert len(east.points) == len(west.points) == 30

@@ -8,9 +8,9 @@ import rasterio
 from numpy.testing import assert_allclose, assert_array_equal
 
 from amers.app.db import points as point_store
-from amers.app.usecases.blocks import lifecycle
 from amers.app.usecases.features import points
 from amers.services.formats.chips import stacks
+from tests.app.served import serve_block
 from tests.factories import make_block
 
 CHIPS = "/collections/points/chips"
@@ -22,16 +22,15 @@ in_single_precision = 1e-7
 def made(connection, storage, tmp_path):
     """A published block of 40 points with 6 chips each, of 16 bits."""
     made = make_block(tmp_path / "block", count=40)
-    lifecycle.ingest_block(connection, storage, made.folder)
-    lifecycle.publish_block(connection, "calanques")
+    serve_block(connection, storage, made.folder)
     connection.commit()
     return made
 
 
 @pytest.fixture
 def get(made, client, bearer):
-    headers = bearer("read")
-    return lambda path, **parameters: client.get(path, params=parameters or None, headers=headers)
+    caller = bearer("read")
+    return lambda path, **parameters: caller.get(path, params=parameters or None)
 
 
 def arrays(reply):
@@ -61,7 +60,7 @@ def test_chips_of_many_points_are_those_of_each_with_their_metadata(made, get):
                 assert_array_equal(chip_arrays[name][rows], expected, err_msg=name)
 
 
-def test_chips_of_a_footprint_are_those_of_the_points_in_it(made, get, client, bearer):
+def test_chips_of_a_footprint_are_those_of_the_points_in_it(made, get, bearer):
     lon, lat = made.points.lon_lat_h[:, 0], made.points.lon_lat_h[:, 1]
     in_box = (lon >= 5.22) & (lon <= 5.27) & (lat >= 43.21) & (lat <= 43.26)
     chips = arrays(get(CHIPS, bbox="5.22,43.21,5.27,43.26"))
@@ -71,7 +70,7 @@ def test_chips_of_a_footprint_are_those_of_the_points_in_it(made, get, client, b
     assert_array_equal(np.unique(strong["point_id"]), FIRST + np.flatnonzero(expected))
     triangle = [[[5.2, 43.2], [5.3, 43.2], [5.2, 43.3], [5.2, 43.2]]]
     body = {"intersects": {"type": "Polygon", "coordinates": triangle}}
-    below = arrays(client.post(CHIPS, json=body, headers=bearer("read")))
+    below = arrays(bearer("read").post(CHIPS, json=body))
     expected = (lon - 5.2) + (lat - 43.2) < 0.1
     assert_array_equal(np.unique(below["point_id"]), FIRST + np.flatnonzero(expected))
 
@@ -99,8 +98,7 @@ def test_chips_of_8_and_16_bits_come_together_with_their_values(
     small = make_block(
         tmp_path / "small", count=5, seed=3, name="small", box=(6.2, 43.2, 6.3, 43.3), dtype=np.uint8
     )
-    lifecycle.ingest_block(connection, storage, small.folder)
-    lifecycle.publish_block(connection, "small")
+    serve_block(connection, storage, small.folder)
     connection.commit()
     chip_arrays = arrays(get(CHIPS, ids=f"{FIRST},{2 * FIRST}"))
     assert chip_arrays["chips"].dtype == np.uint16

@@ -18,7 +18,7 @@ from tests.app.flat_world import make_flat_world
 from tests.app.installation import Installation
 from tests.app.worker_processes import wait_until
 from tests.service_process import free_port
-from tests.statements import run_sql
+from tests.statements import run_in, run_sql
 
 pytestmark = pytest.mark.thorough
 
@@ -100,9 +100,7 @@ def clock(tmp_path: Path) -> WrongClock:
 
 def lease(dsn: str) -> object:
     """When the lease of the job ends; None for a job that has ended."""
-    with engine.connect(dsn) as connection:
-        row = run_sql(connection, "select lease_until from job").fetchone()
-    assert row is not None
+    (row,) = run_in(engine.connect(dsn), "select lease_until from job")
     return row["lease_until"]
 
 
@@ -122,8 +120,7 @@ def test_a_worker_whose_clock_jumps_keeps_its_job(
             )
         ended_job = installation.ended(job)
     assert ended_job["status"] == "successful", ended_job
-    with engine.connect(dsn) as connection:
-        row = run_sql(connection, "select attempt, failures from job").fetchone()
+    (row,) = run_in(engine.connect(dsn), "select attempt, failures from job")
     assert row == {"attempt": 1, "failures": 0}
 
 

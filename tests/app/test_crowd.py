@@ -20,7 +20,7 @@ from amers.app.db import engine
 from amers.app.db.features import pages as features
 from amers.app.main import create_app
 from amers.app.storage import Storage
-from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
+from tests.app.served import serve_block
 from tests.factories import make_block
 
 POINTS = 60
@@ -40,8 +40,7 @@ def app(dsn: str, tmp_path: Path) -> FastAPI:
     settings = Settings(database_url=dsn, data_folder=tmp_path / "data", pool_size=CONNECTIONS)
     with engine.connect(dsn) as connection:
         made = make_block(tmp_path / "block", count=POINTS)
-        ingest_block(connection, Storage(settings.data_folder / "storage"), made.folder)
-        publish_block(connection, "calanques")
+        serve_block(connection, Storage(settings.data_folder / "storage"), made.folder)
     return create_app(settings)
 
 

@@ -20,7 +20,6 @@ from amers.app.config import Settings
 from amers.app.db.engine import Connection, Database
 from amers.app.main import create_app
 from amers.app.storage import Storage, trash
-from amers.app.usecases.blocks import lifecycle
 from amers.app.usecases.installation import Installation
 from amers.app.usecases.jobs import do_attempt
 from amers.app.usecases.references import NewReference, add_reference
@@ -29,6 +28,7 @@ from amers.services.formats.chips.npy_files import read_chip_file
 from tests.app.callers import Bearer
 from tests.app.job_queue import claimed
 from tests.app.s3_server import running_bucket
+from tests.app.served import serve_block
 from tests.factories import BOX, make_block
 from tests.statements import run_sql
 from tests.unproven import unproven_storage
@@ -161,8 +161,7 @@ def filled(
     """The installation, filled."""
     storage = unproven_storage(settings)
     with TestClient(create_app(settings), raise_server_exceptions=False) as client:
-        lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block").folder)
-        lifecycle.publish_block(connection, "calanques")
+        serve_block(connection, storage, make_block(tmp_path / "block").folder)
         reference = NewReference("land", "image.tif", "terrain.tif", "ellipsoid")
         add_reference(connection, settings, reference)
         points = run_sql(connection, "select id, chip_row, chip_count from point").fetchall()

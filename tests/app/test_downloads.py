@@ -8,7 +8,6 @@ from urllib.parse import unquote
 from uuid import UUID
 
 import pytest
-from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -16,7 +15,7 @@ from amers.app.api.disposition import disposition
 from amers.app.db.engine import Database
 from amers.app.db.jobs import attempts
 from amers.app.storage import Storage
-from tests.app.callers import Bearer
+from tests.app.callers import Caller
 from tests.app.job_queue import claimed
 from tests.statements import run_sql
 
@@ -65,39 +64,35 @@ def test_a_browser_shows_what_it_can_show(kind: str, way: str) -> None:
 
 
 def test_files_of_results_and_scenes_have_names(
-    client: TestClient, bearer: Bearer, database: Database, storage: Storage
+    me: Caller, database: Database, storage: Storage
 ) -> None:
-    me = bearer("register")
-    scene = client.post("/scenes?name=my scene.tif", content=TIFF, headers=me).json()
-    reply = client.get(f"/scenes/{scene['id']}/files/{scene['file']}", headers=me)
+    scene = me.post("/scenes?name=my scene.tif", content=TIFF).json()
+    reply = me.get(f"/scenes/{scene['id']}/files/{scene['file']}")
     assert reply.headers["content-disposition"] == 'attachment; filename="my_scene.tif"'
     inputs = {"scene": scene["id"]}
-    sent = client.post("/processes/register-scene/execution", json={"inputs": inputs}, headers=me)
+    sent = me.execute("register-scene", inputs)
     job = claimed(database, UUID(sent.json()["jobID"]))
     names = {"report.html": "inline", "north/scene_RPC.TXT": "inline", "copy.tif": "attachment"}
     keys = {name: storage.put(f"results/{job.id}/1/{name}", [b"x"]).key for name in names}
     with database.transaction() as connection:
         attempts.succeed(connection, job.id, 1, {"files": keys})
     for name, way in names.items():
-        reply = client.get(f"/jobs/{job.id}/results/{name}", headers=me)
+        reply = me.get(f"/jobs/{job.id}/results/{name}")
         kept = name.replace("/", "-")
         assert reply.headers["content-disposition"] == f'{way}; filename="{kept}"'
 
 
-def test_no_text_in_a_csv_is_a_formula_and_numbers_stay_numbers(
-    client: TestClient, bearer: Bearer, connection
-) -> None:
-    me = bearer("register")
+def test_no_text_in_a_csv_is_a_formula_and_numbers_stay_numbers(me, connection) -> None:
     for _ in FORMULAS + PLAIN:
-        client.post("/scenes?name=a.tif", content=TIFF, headers=me)
+        me.post("/scenes?name=a.tif", content=TIFF)
     rows = run_sql(connection, "select id from scene order by created_at").fetchall()
     for row, name in zip(rows, FORMULAS + PLAIN, strict=True):
         run_sql(connection, "update scene set name = %s, sigma_m = 5 where id = %s", [name, row["id"]])
     connection.commit()
-    reply = client.get("/collections/scenes/items?f=csv&limit=100", headers=me)
+    reply = me.get("/collections/scenes/items?f=csv&limit=100")
     assert reply.status_code == 200
     table = list(csv.DictReader(io.StringIO(reply.text, newline="")))
     titles = [row["title"] for row in table]
     assert sorted(titles) == sorted([f"'{text}" for text in FORMULAS] + PLAIN)
-    with_titles = client.get("/collections/scenes/items?limit=100", headers=me).json()["features"]
+    with_titles = me.get("/collections/scenes/items?limit=100").json()["features"]
     assert sorted(one["properties"]["title"] for one in with_titles) == sorted(FORMULAS + PLAIN)

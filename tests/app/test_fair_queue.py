@@ -21,9 +21,9 @@ from amers.app.db.jobs.attempts import LostJob
 from amers.app.usecases.tokens import create_token
 from amers.app.worker.attempt import ATTEMPTS_ALLOWED
 from amers.app.worker.sweep import sweep_jobs
-from tests.app.job_queue import LEASE_S, let_lease_lapse, tickets
+from tests.app.job_queue import LEASE_S, let_lease_lapse, requested, tickets
 from tests.app.worker_processes import ended, running_worker, wait_until
-from tests.statements import run_sql
+from tests.statements import run_in, run_sql
 
 FLOOD = 1000
 TAKE_TICKET = "select id from procrastinate_fetch_job_v2(null, null) where id is not null"
@@ -39,8 +39,7 @@ def owner_named(connection: Connection, name: str) -> UUID:
 
 def ask(connection: Connection, owner: UUID | None, priority: int = 0) -> UUID:
     """The id of a new job of an owner."""
-    job = jobs.create(connection, "register-scene", {"scene": str(uuid4())}, owner, priority=priority)
-    assert job is not None
+    job = requested(connection, "register-scene", {"scene": str(uuid4())}, owner, priority=priority)
     return job.id
 
 
@@ -134,7 +133,7 @@ def test_only_administrators_give_priorities(client: TestClient, bearer):
     assert (beyond.status_code, "amers:priority" in beyond.json()["detail"]) == (422, True)
 
 
-def test_nobody_else_gives_a_priority_below_the_usual_one_either(client: TestClient, bearer):
+def test_nobody_else_gives_a_priority_below_the_usual_one_either(bearer):
     execute, me = "/processes/register-scene/execution", bearer("register")
     scene = me.scene(b"II*\0" + bytes(100), "name=a.tif")
     for priority, status in ((-1, 403), (0, 201)):
@@ -358,17 +357,15 @@ class Crowd:
         """Take tickets, as procrastinate's workers take them, and end the jobs they call for."""
         chance = random.Random(number)
         while not self.stop.is_set():
-            with self.database.transaction() as connection:
-                ticket = run_sql(connection, TAKE_TICKET).fetchone()
-            if ticket is None:
+            taken = run_in(self.database.transaction(), TAKE_TICKET)
+            if not taken:
                 time.sleep(0.005)
                 continue
             job = self.claim(f"w{number}")
             if job is not None:
                 with suppress(LostJob), self.database.transaction() as connection:
                     self.end(connection, job, chance.random())
-            with self.database.transaction() as connection:
-                run_sql(connection, END_TICKET, [ticket["id"]])
+            run_in(self.database.transaction(), END_TICKET, [taken[0]["id"]])
 
     def claim(self, worker: str) -> jobs.Job | None:
         """The next job, noted together with the running jobs beside it."""
@@ -421,11 +418,9 @@ def test_workers_at_once_do_every_job_once_within_the_limit_and_forget_none(data
 
 def open_jobs(database: Database) -> int:
     """The number of jobs that have not ended."""
-    with database.transaction() as connection:
-        row = run_sql(
-            connection, "select count(*) as n from job where state in ('accepted', 'running')"
-        ).fetchone()
-    assert row is not None
+    (row,) = run_in(
+        database.transaction(), "select count(*) as n from job where state in ('accepted', 'running')"
+    )
     return int(row["n"])
 
 

@@ -19,6 +19,7 @@ from amers.app.db import superseding
 from amers.app.usecases.blocks import lifecycle
 from amers.app.usecases.features import items
 from amers.app.usecases.history import suspend_point
+from tests.app.served import serve_block
 from tests.factories import make_block
 from tests.statements import run_sql
 
@@ -31,16 +32,15 @@ a_tenth_of_a_millimetre_deg = 1e-9
 def made(connection, storage, tmp_path):
     """A published block of 60 points."""
     made = make_block(tmp_path / "block", count=60)
-    lifecycle.ingest_block(connection, storage, made.folder)
-    lifecycle.publish_block(connection, "calanques")
+    serve_block(connection, storage, made.folder)
     connection.commit()
     return made
 
 
 @pytest.fixture
 def get(made, client, bearer):
-    headers = bearer("read")
-    return lambda path, **parameters: client.get(path, params=parameters or None, headers=headers)
+    caller = bearer("read")
+    return lambda path, **parameters: caller.get(path, params=parameters or None)
 
 
 @pytest.mark.parametrize("form", ["fgb", "parquet", "gpkg"])
@@ -322,26 +322,26 @@ def test_a_tile_has_the_points_of_its_margin_so_that_no_symbol_is_cut(get, made,
 
 
 def test_the_tag_of_a_tile_changes_when_a_point_is_suspended_and_is_not_that_of_other_viewers(
-    get, client, bearer, connection
+    get, bearer, connection
 ):
     points, blocks = (TILES.format(name, 8, *tile_of(5.25, 43.25, 8)) for name in ("points", "blocks"))
     before = get(points).headers["etag"]
     suspend_point(connection, 2**26 + 3, "a house was built")
     connection.commit()
     assert get(points).headers["etag"] != before
-    of_administrators = client.get(blocks, headers=bearer("admin")).headers["etag"]
+    of_administrators = bearer("admin").get(blocks).headers["etag"]
     assert of_administrators != get(blocks).headers["etag"]
 
 
 def test_a_tile_that_has_not_changed_is_not_sent_again(made, client, bearer, connection):
-    headers = bearer("read")
+    caller = bearer("read")
     path = TILES.format("points", 8, *tile_of(5.25, 43.25, 8))
-    first = client.get(path, headers=headers)
-    again = client.get(path, headers={**headers, "If-None-Match": first.headers["etag"]})
+    first = caller.get(path)
+    again = client.get(path, headers={**caller, "If-None-Match": first.headers["etag"]})
     assert (again.status_code, again.content) == (304, b"")
     lifecycle.withdraw_block(connection, "calanques")
     connection.commit()
-    after = client.get(path, headers={**headers, "If-None-Match": first.headers["etag"]})
+    after = client.get(path, headers={**caller, "If-None-Match": first.headers["etag"]})
     assert (after.status_code, after.content) == (200, b"")
 
 

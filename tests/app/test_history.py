@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
-from fastapi.testclient import TestClient
 from typer.testing import CliRunner
 
 from amers.app.cli.main import app as amers
@@ -17,11 +16,10 @@ from amers.app.config import Settings
 from amers.app.db import engine, history
 from amers.app.db.engine import Connection, Database
 from amers.app.db.history import NOT_ATTRIBUTABLE
-from amers.app.db.jobs import attempts, jobs
+from amers.app.db.jobs import attempts
 from amers.app.db.jobs.attempts import LostJob
 from amers.app.errors import Conflict, InputError, NotFound
 from amers.app.storage import Storage
-from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
 from amers.app.usecases.history import (
     find_history,
     list_histories,
@@ -42,7 +40,8 @@ from amers.services.registration.options import RegistrationOptions
 from amers.services.types import health
 from tests.app.callers import Bearer
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
-from tests.app.job_queue import claim, store_registration
+from tests.app.job_queue import claim, requested, store_registration
+from tests.app.served import serve_block
 from tests.statements import run_sql
 
 VANISHED = 5
@@ -87,8 +86,7 @@ def database(dsn: str, settings: Settings) -> Iterator[Database]:
 @pytest.fixture
 def first_id(world: FlatWorld, connection: Connection, storage: Storage) -> int:
     """The id in the store of the first point of the published block."""
-    block = ingest_block(connection, storage, world.block).block
-    publish_block(connection, str(block.number))
+    block = serve_block(connection, storage, world.block)
     connection.commit()
     return block.number << 26
 
@@ -352,8 +350,7 @@ def test_a_failed_registration_is_stored_and_does_not_count(
 def test_an_attempt_that_has_lost_its_job_counts_nothing(
     connection: Connection, database: Database, stored: Registration
 ) -> None:
-    job = jobs.create(connection, "register-scene", {})
-    assert job is not None
+    job = requested(connection, "register-scene", {})
     for attempt in (1, 2):
         assert claim(connection, job.id, "a worker", 30.0)
         if attempt == 1:
@@ -477,7 +474,7 @@ def test_the_next_registration_prefers_points_that_have_served(
 
 
 def test_a_failing_point_is_proposed_for_suspension_and_served_until_the_decision(
-    client: TestClient, connection: Connection, bearer: Bearer, stored: Registration, first_id: int
+    connection: Connection, bearer: Bearer, stored: Registration, first_id: int
 ) -> None:
     reader, admin = bearer("read"), bearer("admin")
 

@@ -15,7 +15,7 @@ from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.flat_world import FlatWorld, make_flat_world
 from tests.app.hostile_installation import CANARY, LEFT_BY_JOBS, Installation, hostile_installation
 from tests.app.worker_processes import running_worker, wait_until
-from tests.statements import run_sql
+from tests.statements import run_in
 
 pytestmark = [pytest.mark.long, pytest.mark.security]
 
@@ -228,8 +228,7 @@ def test_bombs_end_as_failed_jobs_within_their_limits(
 
         wait_until(lambda: not open_jobs(), f"{len(jobs)} jobs end", PATIENCE_S)
         assert worker.poll() is None, "the worker lives"
-    with store.database.transaction() as connection:
-        rows = run_sql(connection, "select id::text, state, attempt, error from job").fetchall()
+    rows = run_in(store.database.transaction(), "select id::text, state, attempt, error from job")
     ended = {row["id"]: row for row in rows}
     for name, job in jobs.items():
         outcome = ended[job]

@@ -24,7 +24,7 @@ from tests.app.job_queue import (
     store_registration,
     tickets,
 )
-from tests.statements import run_sql
+from tests.statements import run_in, run_sql
 
 
 def in_transaction(
@@ -99,8 +99,7 @@ def test_a_job_given_back_waits_again_without_counting_a_failure(database: Datab
 def test_a_job_given_back_calls_another_worker(database: Database):
     """The ticket of the worker that stops ends with it."""
     job = new_job(database)
-    with database.transaction() as connection:
-        run_sql(connection, "update procrastinate_jobs set status = 'doing'")
+    run_in(database.transaction(), "update procrastinate_jobs set status = 'doing'")
     attempt = claimed(database, job.id).attempt
     with database.transaction() as connection:
         assert tickets(connection) == 0
@@ -214,11 +213,9 @@ RETURNS: dict[str, Callable[[Database, Job], object]] = {
 
 
 def lease_and_worker(database: Database, job: Job) -> tuple[object, object]:
-    with database.transaction() as connection:
-        row = run_sql(
-            connection, "select lease_until, worker from job where id = %s", [job.id]
-        ).fetchone()
-    assert row is not None
+    (row,) = run_in(
+        database.transaction(), "select lease_until, worker from job where id = %s", [job.id]
+    )
     return row["lease_until"], row["worker"]
 
 
@@ -272,11 +269,10 @@ def test_a_lease_that_is_renewed_is_not_taken_back(database: Database):
 def test_a_ticket_that_the_queue_has_lost_is_issued_again_once(database: Database):
     for _ in range(2):
         new_job(database)
-    with database.transaction() as connection:
-        run_sql(
-            connection,
-            "delete from procrastinate_jobs where id in (select min(id) from procrastinate_jobs)",
-        )
+    run_in(
+        database.transaction(),
+        "delete from procrastinate_jobs where id in (select min(id) from procrastinate_jobs)",
+    )
     sweep_jobs(database, LEASE_S)
     with database.transaction() as connection:
         assert tickets(connection) == 1, "the worker that has just taken it may be about to claim"

@@ -13,7 +13,7 @@ from amers.app.db.jobs.progress import Outlook
 from amers.app.storage import Storage
 from amers.app.worker.sweep import sweep_records
 from tests.app.job_queue import claim
-from tests.statements import run_sql
+from tests.statements import run_in, run_sql
 
 LEASE_S = 30.0
 a_slow_machine = timedelta(seconds=15)
@@ -214,8 +214,7 @@ def test_old_results_are_removed_and_the_job_reports_it(
     sweep_records(database, storage, settings.model_copy(update={"result_days": None}))
     sweep_records(database, storage, kept_for_two_days)
     assert len(storage.keys("results")) == 2, "the service has not run for two days: the clock jumped"
-    with database.transaction() as connection:
-        run_sql(connection, "update uptime set elapsed_s = elapsed_s + 2.5 * 86400")
+    run_in(database.transaction(), "update uptime set elapsed_s = elapsed_s + 2.5 * 86400")
     sweep_records(database, storage, settings.model_copy(update={"result_days": None}))
     assert len(storage.keys("results")) == 2, "all are kept for ever"
     for _ in range(2):

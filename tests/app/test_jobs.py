@@ -22,6 +22,7 @@ from amers.services.errors import FormatError, NotEnoughPoints
 from amers.services.formats.block.problems import BlockProblems, Problem
 from tests.app.callers import Bearer, Caller
 from tests.app.job_queue import LEASE_S, claimed, tickets
+from tests.app.sending import begun
 from tests.statements import run_sql
 
 EXECUTE = "/processes/register-scene/execution"
@@ -90,15 +91,14 @@ def test_work_needs_a_token_that_allows_it(client: TestClient, bearer: Bearer, s
     assert bearer("read").post(EXECUTE, json=body).status_code == 403
 
 
-def test_a_scene_of_another_owner_cannot_be_registered(client: TestClient, bearer: Bearer, scene: str):
+def test_a_scene_of_another_owner_cannot_be_registered(bearer: Bearer, scene: str):
     reply = bearer("register").post(EXECUTE, json={"inputs": {"scene": scene}})
     assert reply.status_code == 404
     assert scene in reply.json()["detail"]
 
 
-def test_a_scene_whose_image_arrives_still_cannot_be_registered(client: TestClient, me: Caller):
-    tus = {"Tus-Resumable": "1.0.0", "Upload-Length": "10", "Upload-Metadata": "filename YS50aWY="}
-    arriving = client.post("/uploads", headers=me | tus).headers["amers-scene"]
+def test_a_scene_whose_image_arrives_still_cannot_be_registered(me: Caller):
+    arriving = begun(me, 10, filename="a.tif").headers["amers-scene"]
     reply = me.post(EXECUTE, json={"inputs": {"scene": arriving}})
     assert reply.status_code == 409
     assert "is uploading" in reply.json()["detail"]

@@ -23,7 +23,7 @@ from amers.app.usecases.jobs import PROCESSES, do_attempt
 from amers.app.usecases.processes import Commit, Process, Work
 from amers.app.worker.attempt import Attempts
 from tests.app.job_queue import claimed, let_lease_lapse, new_job, state_of
-from tests.statements import run_sql
+from tests.statements import run_in, run_sql
 
 Event = Callable[[Database, Job], None]
 
@@ -96,15 +96,12 @@ def process(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Work], None]
 
 
 def stored(database: Database) -> int:
-    with database.transaction() as connection:
-        row = run_sql(connection, "select count(*) as n from scene").fetchone()
-    assert row is not None
+    (row,) = run_in(database.transaction(), "select count(*) as n from scene")
     return int(row["n"])
 
 
 def rows_of_jobs(database: Database) -> list[dict[str, object]]:
-    with database.transaction() as connection:
-        return run_sql(connection, "select * from job").fetchall()
+    return run_in(database.transaction(), "select * from job")
 
 
 def test_an_attempt_that_keeps_its_job_stores_its_outcome(database, settings, job, process):
@@ -225,9 +222,7 @@ def test_progress_is_in_whole_percent_that_are_done(
 
 
 def reserved_bytes(database: Database, job: Job) -> int:
-    with database.transaction() as connection:
-        row = run_sql(connection, "select results_bytes from job where id = %s", [job.id]).fetchone()
-    assert row is not None
+    (row,) = run_in(database.transaction(), "select results_bytes from job where id = %s", [job.id])
     return int(row["results_bytes"])
 
 

@@ -37,7 +37,7 @@ from tests.app.test_orthorectification import write_inputs
 from tests.app.test_vectors import drawn as drawn_vectors
 from tests.open_archive import CENTRE as OPEN_CENTRE
 from tests.open_archive import make_archive
-from tests.statements import run_sql
+from tests.statements import run_in
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
@@ -173,13 +173,12 @@ def do_job(server: WarmServer, place: Place, direct_dsn: str, job_id: UUID) -> J
             job = state_of(direct, job_id)
             if job.state not in ("accepted", "running"):
                 return job
-            with direct.transaction() as connection:
-                run_sql(
-                    connection,
-                    "update job set not_before = null, lease_until = case state when 'running'"
-                    " then now() - interval '1 second' end where id = %s",
-                    [job_id],
-                )
+            run_in(
+                direct.transaction(),
+                "update job set not_before = null, lease_until = case state when 'running'"
+                " then now() - interval '1 second' end where id = %s",
+                [job_id],
+            )
             sweep_jobs(direct, LEASE_S)
     return job
 

@@ -5,8 +5,8 @@ import pytest
 from psycopg.conninfo import make_conninfo
 
 from amers.app.db.cluster.embedded import SUPERUSER
-from amers.app.usecases.blocks import lifecycle
 from benchmarks._filled import ROW_BLOCKS, fill, lay_out
+from tests.app.served import serve_block
 from tests.factories import make_block
 
 POINTS, BLOCK_POINTS, FOOTPRINT_POINTS = 70_000, 1_000, 100
@@ -30,17 +30,16 @@ def test_points_that_would_leave_the_earth_are_refused():
 
 
 @pytest.mark.thorough
-def test_seventy_blocks_are_served_as_one_is(dsn, connection, storage, client, bearer, tmp_path):
+def test_seventy_blocks_are_served_as_one_is(dsn, connection, storage, bearer, tmp_path):
     # The filling switches triggers off, which only a superuser may.
     ground = fill(make_conninfo(dsn, user=SUPERUSER), POINTS, block_points=BLOCK_POINTS)
     chips = make_block(tmp_path / "block", count=10, name="chips", box=(5.0, 80.0, 5.4, 80.08))
-    lifecycle.ingest_block(connection, storage, chips.folder)
-    lifecycle.publish_block(connection, "chips")
+    serve_block(connection, storage, chips.folder)
     connection.commit()
-    headers, rng = bearer("read"), np.random.default_rng(1)
+    caller, rng = bearer("read"), np.random.default_rng(1)
 
     def get(path):
-        reply = client.get(path, headers=headers)
+        reply = caller.get(path)
         assert reply.status_code == 200, reply.text
         return reply
 

@@ -381,5 +381,5 @@ def test_an_issuer_with_https_has_its_keys_fetched_with_https_alone(
     assert is_accepted(settings, issuer, oidc_issuer=url) is fetched
 
 
-def test_tokens_of_our_own_go_on_beside_those_of_the_issuer(client, bearer):
-    assert client.get("/tokens/self", headers=bearer("read")).status_code == 200
+def test_tokens_of_our_own_go_on_beside_those_of_the_issuer(bearer):
+    assert bearer("read").get("/tokens/self").status_code == 200

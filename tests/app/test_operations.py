@@ -22,6 +22,7 @@ from amers.app.usecases.history import suspend_point
 from amers.app.usecases.tokens import create_token
 from amers.app.usecases.usage import read_all_usage
 from tests.app.job_queue import claim
+from tests.app.served import serve_block
 from tests.factories import make_block
 from tests.statements import run_sql
 
@@ -35,8 +36,7 @@ def changes(connection, **chosen) -> list:
 def test_every_step_of_a_block_is_recorded_with_its_state_before_and_after(
     connection, storage, tmp_path
 ):
-    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
-    lifecycle.publish_block(connection, "calanques")
+    serve_block(connection, storage, make_block(tmp_path / "block", 5).folder)
     lifecycle.withdraw_block(connection, "calanques")
     recorded = changes(connection, kind="block", subject="calanques@1")
     assert [change.action for change in recorded] == ["created", "changed", "changed"]
@@ -56,8 +56,7 @@ def test_the_record_only_grows(connection, statement):
         run_sql(connection, statement)
 
 
-def test_a_change_over_the_api_names_caller_and_request(client, connection, bearer):
-    admin = bearer("admin")
+def test_a_change_over_the_api_names_caller_and_request(client, connection, admin):
     made = client.post(
         "/tokens",
         json={"name": "office", "scopes": ["read"], "days": 3},
@@ -68,7 +67,7 @@ def test_a_change_over_the_api_names_caller_and_request(client, connection, bear
     (change,) = recorded
     assert (change.actor_name, change.request_id) == ("a token to admin", "morning-1")
     assert "secret_hash" not in (change.after or {})
-    listed = client.get("/audit", params={"kind": "token", "limit": 1}, headers=admin).json()
+    listed = admin.get("/audit", params={"kind": "token", "limit": 1}).json()
     assert listed["changes"][0]["subject"] == made.json()["id"]
     assert any(link["rel"] == "next" for link in listed["links"])
 
@@ -99,29 +98,28 @@ def test_work_of_a_job_is_recorded_with_the_owner_of_the_job(dsn, connection):
 @pytest.mark.parametrize("path", ["/audit", "/tokens"])
 def test_the_record_and_the_tokens_are_for_administrators(client, bearer, path):
     assert client.get(path).status_code == 401
-    assert client.get(path, headers=bearer("register")).status_code == 403
-    assert client.get(path, headers=bearer("admin")).status_code == 200
+    assert bearer("register").get(path).status_code == 403
+    assert bearer("admin").get(path).status_code == 200
 
 
-def test_an_administrator_makes_lists_and_revokes_tokens_over_the_api(client, bearer):
-    admin = bearer("admin")
+def test_an_administrator_makes_lists_and_revokes_tokens_over_the_api(client, admin):
     body = {"name": "office", "scopes": ["register"], "job_quota": 2}
-    made = client.post("/tokens", json=body, headers=admin)
+    made = admin.post("/tokens", json=body)
     assert made.status_code == 201
     token = made.json()
     own = {"Authorization": f"Bearer {token['secret']}"}
     assert client.get("/tokens/self", headers=own).json()["scopes"] == ["register"]
-    listed = client.get("/tokens", headers=admin).json()["tokens"]
+    listed = admin.get("/tokens").json()["tokens"]
     assert token["id"] in [one["id"] for one in listed]
     assert "secret" not in json.dumps(listed)
-    revoked = client.delete(f"/tokens/{token['id']}", headers=admin)
+    revoked = admin.delete(f"/tokens/{token['id']}")
     assert revoked.json()["revoked_at"] is not None
     assert client.get("/tokens/self", headers=own).status_code == 401
     assert client.get("/tokens/self").status_code == 401
-    assert client.delete(f"/tokens/{token['id']}", headers=admin).status_code == 404
+    assert admin.delete(f"/tokens/{token['id']}").status_code == 404
 
 
-def test_a_token_with_unusable_properties_is_refused_over_the_api(client, bearer):
+def test_a_token_with_unusable_properties_is_refused_over_the_api(bearer):
     for body in [
         {"name": "x", "scopes": ["everything"]},
         {"name": "", "scopes": ["read"]},
@@ -131,7 +129,7 @@ def test_a_token_with_unusable_properties_is_refused_over_the_api(client, bearer
         {"name": "x", "scopes": ["read"], "storage_quota_bytes": 2**63},
         {"name": "x", "scopes": ["read"], "surprise": 1},
     ]:
-        assert client.post("/tokens", json=body, headers=bearer("admin")).status_code == 422, body
+        assert bearer("admin").post("/tokens", json=body).status_code == 422, body
 
 
 def test_a_token_has_no_more_open_jobs_than_its_quota(connection, settings):
@@ -184,14 +182,13 @@ def families(text: str) -> dict:
 
 def test_metrics_report_requests_jobs_points_and_disk(client, connection, storage, bearer, tmp_path):
     made = make_block(tmp_path / "block", 7)
-    lifecycle.ingest_block(connection, storage, made.folder)
-    lifecycle.publish_block(connection, "calanques")
+    serve_block(connection, storage, made.folder)
     jobs.create(connection, "register-scene", {})
     connection.commit()
     client.get("/healthz")
     client.get("/no/such/thing")
     client.request("ODD", "/healthz")
-    metric_families = families(client.get("/metrics", headers=bearer("monitor")).text)
+    metric_families = families(bearer("monitor").get("/metrics").text)
     value = {name: family.samples[0].value for name, family in metric_families.items() if family.samples}
     assert value["amers_points_published"] == 7
     assert value["amers_queue_length"] == 1
@@ -212,14 +209,13 @@ def test_metrics_report_requests_jobs_points_and_disk(client, connection, storag
     assert not any(method == "ODD" for method, _, _ in counts)
 
 
-def test_the_status_has_the_queue_and_what_is_stored(client, connection, storage, bearer, tmp_path):
+def test_the_status_has_the_queue_and_what_is_stored(connection, storage, bearer, tmp_path):
     made = make_block(tmp_path / "block", 7)
-    lifecycle.ingest_block(connection, storage, made.folder)
-    lifecycle.publish_block(connection, "calanques")
+    serve_block(connection, storage, made.folder)
     jobs.create(connection, "register-scene", {})
     connection.commit()
-    assert client.get("/status", headers=bearer("monitor")).status_code == 403
-    status = client.get("/status", headers=bearer("admin")).json()
+    assert bearer("monitor").get("/status").status_code == 403
+    status = bearer("admin").get("/status").json()
     assert (status["jobs_waiting"], status["jobs_running"], status["workers"]) == (1, 0, 0)
     assert status["oldest_waiting_s"] > 0
     assert status["points_served"] == 7
@@ -278,14 +274,14 @@ def test_who_keeps_most_comes_first_with_the_share_of_his_own_quota(connection, 
     assert listed == [("much", 0.25), ("nothing allowed", None), ("little", 0.5)]
 
 
-def test_chips_that_two_blocks_share_are_stored_once(client, connection, storage, bearer, tmp_path):
+def test_chips_that_two_blocks_share_are_stored_once(connection, storage, bearer, tmp_path):
     administrator = bearer("admin")
     sizes = []
     for version in ("1", "2"):
         made = make_block(tmp_path / version, 7, version=version)
         lifecycle.ingest_block(connection, storage, made.folder)
         connection.commit()
-        sizes.append(client.get("/status", headers=administrator).json()["chip_bytes"])
+        sizes.append(administrator.get("/status").json()["chip_bytes"])
     assert sizes[0] == sizes[1] > 0
 
 
@@ -293,17 +289,17 @@ def test_the_audit_trail_is_filtered_by_who_made_the_changes(client, bearer):
     administrator = bearer("admin")
     for name in ("Ada", "Bob"):
         body = {"name": name, "scopes": ["admin"]}
-        secret = client.post("/tokens", json=body, headers=administrator).json()["secret"]
+        secret = administrator.post("/tokens", json=body).json()["secret"]
         made = {"name": f"of {name}", "scopes": ["read"]}
         client.post("/tokens", json=made, headers={"Authorization": f"Bearer {secret}"})
-    changes = client.get("/audit?actor=Ada", headers=administrator).json()["changes"]
+    changes = administrator.get("/audit?actor=Ada").json()["changes"]
     assert [change["after"]["name"] for change in changes] == ["of Ada"]
-    assert client.get("/audit?actor=nobody", headers=administrator).json()["changes"] == []
+    assert administrator.get("/audit?actor=nobody").json()["changes"] == []
 
 
 def test_metrics_are_closed_until_a_setting_opens_them(client, settings, bearer):
     assert client.get("/metrics").status_code == 401
-    assert client.get("/metrics", headers=bearer("read")).status_code == 403
+    assert bearer("read").get("/metrics").status_code == 403
     client.app.state.settings = settings.model_copy(update={"public_metrics": True})
     assert client.get("/metrics").status_code == 200
 

@@ -29,6 +29,7 @@ from amers.app.usecases.features import query as queries
 from amers.app.usecases.features.items import COLLECTIONS, everything_in
 from amers.app.usecases.features.query import FeatureQuery, condition_of
 from amers.services.geodesy import east_north_up
+from tests.app.served import serve_block
 from tests.factories import make_block
 from tests.statements import run_sql
 
@@ -42,8 +43,7 @@ a_step_of_the_planner = 0.02
 def made(connection, storage, tmp_path):
     """A published block of 60 points; a staged one of 10 lies in the same place."""
     made = make_block(tmp_path / "block", count=60)
-    lifecycle.ingest_block(connection, storage, made.folder)
-    lifecycle.publish_block(connection, "calanques")
+    serve_block(connection, storage, made.folder)
     lifecycle.ingest_block(
         connection, storage, make_block(tmp_path / "b", count=10, seed=5, name="staged").folder
     )
@@ -54,8 +54,8 @@ def made(connection, storage, tmp_path):
 @pytest.fixture
 def get(client, bearer):
     """GET with scope `read`; returns the reply."""
-    headers = bearer("read")
-    return lambda path: client.get(path, headers=headers)
+    caller = bearer("read")
+    return lambda path: caller.get(path)
 
 
 def test_points_of_a_box_are_a_valid_feature_collection(made, get):
@@ -193,8 +193,7 @@ def test_a_box_across_the_antimeridian_has_both_sides_and_nothing_between(
     made = make_block(tmp_path / "far", count=50, box=(179.9, -17.0, -179.9, -16.9))
     near = make_block(tmp_path / "near", count=9, name="near")
     for block in (made, near):
-        lifecycle.ingest_block(connection, storage, block.folder)
-        lifecycle.publish_block(connection, block.metadata.id)
+        serve_block(connection, storage, block.folder)
     connection.commit()
     page = get(f"{ITEMS}?bbox=179.95,-17,-179.95,-16.9").json()
     lon = made.points.lon_lat_h[:, 0]
@@ -243,8 +242,7 @@ def test_the_number_of_points_is_exact_to_ten_thousand_and_estimated_beyond(
         gsds_m=(2.0,),
         dtype=np.uint8,
     )
-    lifecycle.ingest_block(connection, storage, many.folder)
-    lifecycle.publish_block(connection, "calanques")
+    serve_block(connection, storage, many.folder)
     hidden = make_block(tmp_path / "hidden", count=3_000, n_images=2, gsds_m=(2.0,), name="hidden")
     lifecycle.ingest_block(connection, storage, hidden.folder)
     run_sql(connection, "analyze point")

@@ -23,10 +23,10 @@ from amers.app.errors import InputError
 from amers.app.main import ROUTERS, create_app
 from amers.app.public_url import FOLDERS, LEAVES, normal_public_url
 from amers.app.storage import Storage
-from amers.app.usecases.blocks import lifecycle
 from amers.app.web import page
 from tests.app.callers import Bearer
 from tests.app.ledger import job_runner
+from tests.app.served import serve_block
 from tests.factories import make_block
 from tests.links import POST_ALONE, kind_of, urls_of
 
@@ -64,18 +64,14 @@ def filled(
     """An installation with rows of all kinds; headers of its administrator."""
     made = make_block(tmp_path / "block", count=3)
     with engine.connect(dsn) as connection:
-        lifecycle.ingest_block(connection, storage, made.folder)
-        lifecycle.publish_block(connection, "calanques")
+        serve_block(connection, storage, made.folder)
     me = bearer("admin")
-    scenes = [
-        client.post(f"/scenes?name={name}", content=TIFF, headers=me).json()["id"]
-        for name in ("a.tif", "b.tif")
-    ]
-    client.put(f"/scenes/{scenes[0]}/files/a_RPC.TXT", content=b"LINE_OFF: 1", headers=me)
+    scenes = [me.post(f"/scenes?name={name}", content=TIFF).json()["id"] for name in ("a.tif", "b.tif")]
+    me.put(f"/scenes/{scenes[0]}/files/a_RPC.TXT", content=b"LINE_OFF: 1")
     assert client.post("/uploads", headers=me | TUS).status_code == 201
     assert job_runner(client, database, settings, me)("export-block", bbox=BOX)["status"] == "successful"
     asked = {"inputs": {"scene": scenes[0]}}
-    assert client.post("/processes/register-scene/execution", json=asked, headers=me).status_code == 201
+    assert me.post("/processes/register-scene/execution", json=asked).status_code == 201
     return me
 
 
@@ -159,8 +155,8 @@ def test_the_public_address_itself_is_the_landing_page(client: TestClient, path:
 
 
 @pytest.mark.parametrize("path", ["/amers/collections/", "/map/"])
-def test_a_slash_too_many_does_not_lead_away(client: TestClient, path: str, bearer: Bearer):
-    reply = client.get(path, headers=bearer("read"))
+def test_a_slash_too_many_does_not_lead_away(path: str, bearer: Bearer):
+    reply = bearer("read").get(path)
     below = path.removeprefix("/amers").strip("/")
     assert reply.status_code == 200 or reply.headers["location"] == f"{PUBLIC}{below}"
 

@@ -20,7 +20,7 @@ from amers.app.usecases import readiness
 from amers.app.usecases.installation import Installation
 from amers.app.usecases.readiness import Readiness
 from tests.app.s3_server import KEYS
-from tests.statements import run_sql
+from tests.statements import run_in
 
 NO_WORKER = {
     "status": "degraded",
@@ -52,17 +52,16 @@ def test_a_service_with_a_worker_is_ready_and_without_one_it_still_answers(clien
     parts = {"database": OK, "schema": OK, "worker": NO_WORKER, "storage": OK, "disk": OK, "address": OK}
     reply = client.get("/readyz")
     assert (reply.status_code, reply.json()) == (200, {"status": "degraded", "parts": parts})
-    with engine.connect(dsn) as connection:
-        run_sql(connection, "insert into procrastinate_workers default values")
+    run_in(engine.connect(dsn), "insert into procrastinate_workers default values")
     assert client.get("/readyz").json() == {"status": "ready", "parts": parts | {"worker": OK}}
-    with engine.connect(dsn) as connection:
-        run_sql(connection, "update procrastinate_workers set last_heartbeat = now() - interval '60 s'")
+    run_in(
+        engine.connect(dsn), "update procrastinate_workers set last_heartbeat = now() - interval '60 s'"
+    )
     assert client.get("/readyz").json()["parts"]["worker"] == NO_WORKER
 
 
 def test_another_schema_is_named_with_what_to_do(part, dsn):
-    with engine.connect(dsn) as connection:
-        run_sql(connection, "update alembic_version set version_num = '9999'")
+    run_in(engine.connect(dsn), "update alembic_version set version_num = '9999'")
     state = part("schema", 503)
     assert state["status"] == "failed"
     assert "9999" in state["reason"]

@@ -22,7 +22,7 @@ from amers.app.usecases.retention import remove_old_results
 from amers.services.formats.sensor_models.rpc_files import read_rpc
 from amers.services.sensors.correction import CorrectedModel, no_correction
 from amers.services.sensors.refined import refined_rpc
-from tests.app.callers import Bearer
+from tests.app.callers import Bearer, Caller
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
 from tests.app.registration_outputs import (
     A_TENTH_OF_A_PIXEL,
@@ -79,8 +79,8 @@ def test_a_scene_goes_from_upload_to_a_refined_model_by_http(
     world: FlatWorld,
     tmp_path: Path,
     dsn: str,
+    me: Caller,
 ):
-    me = bearer("register")
     upload = me.post(f"/scenes?name=scene.tif&sigma_m={SIGMA_M}", content=world.image.read_bytes())
     scene = upload.json()["id"]
     write_check_points(tmp_path / "checks.geojson", world)
@@ -159,8 +159,8 @@ def test_a_job_that_finds_no_consensus_keeps_the_report_of_its_failure(
     tmp_path: Path,
     database: Database,
     storage: Storage,
+    me: Caller,
 ):
-    me = bearer("register")
     # The points lie 8 m from where a model with a stated accuracy of 0.1 m expects them.
     image = world.tagged.read_bytes()
     scene = me.scene(image, f"name=scene.tif&sigma_m={SIGMA_M}")
@@ -214,13 +214,12 @@ def test_a_job_that_finds_no_consensus_keeps_the_report_of_its_failure(
 
 def test_a_job_whose_verdict_is_failed_says_so_in_every_list(
     client: TestClient,
-    bearer: Bearer,
+    me: Caller,
     settings: Settings,
     published: None,
     world: FlatWorld,
     tmp_path: Path,
 ):
-    me = bearer("register")
     image = world.tagged.read_bytes()
     scene = me.scene(image, f"name=scene.tif&sigma_m={SIGMA_M}")
     strict = {"options": {"qualification": {"usable_active_points": 1000}}}

@@ -6,7 +6,6 @@ from uuid import UUID
 import numpy as np
 import pytest
 import rasterio
-from fastapi.testclient import TestClient
 
 from amers.app.config import Settings
 from amers.app.db.engine import Database
@@ -27,7 +26,6 @@ from tests.app.job_queue import claimed, state_of
     ],
 )
 def test_a_job_whose_scene_is_removed_names_the_scene(
-    client: TestClient,
     bearer: Bearer,
     settings: Settings,
     database: Database,
@@ -41,13 +39,13 @@ def test_a_job_whose_scene_is_removed_names_the_scene(
     shape = {"count": 1, "height": 64, "width": 64, "dtype": "uint8"}
     with rasterio.open(path, "w", driver="GTiff", **shape) as file:
         file.write(np.ones((1, 64, 64), "uint8"))
-    scene = client.post("/scenes?name=scene.tif", content=path.read_bytes(), headers=me).json()["id"]
-    sent = client.post(f"/processes/{process}/execution", json={"inputs": {"scene": scene}}, headers=me)
+    scene = me.post("/scenes?name=scene.tif", content=path.read_bytes()).json()["id"]
+    sent = me.post(f"/processes/{process}/execution", json={"inputs": {"scene": scene}})
     job = claimed(database, UUID(sent.json()["jobID"]))
     real = getattr(module, step)
 
     def removing(*arguments: object, **named: object) -> object:
-        assert client.delete(f"/scenes/{scene}", headers=me).status_code == 204
+        assert me.delete(f"/scenes/{scene}").status_code == 204
         return real(*arguments, **named)
 
     monkeypatch.setattr(module, step, removing)

@@ -400,16 +400,16 @@ def test_an_administrator_renews_a_block_by_a_job(
     dsn: str,
 ) -> None:
     admin, me = bearer("admin"), bearer("register")
-    assert client.patch("/blocks/flat", json={"priority": 3}, headers=admin).status_code == 200
+    assert admin.patch("/blocks/flat", json={"priority": 3}).status_code == 200
     register = job_runner(client, database, settings, me)
     image = scenes.year[0]
     name = f"/scenes?name={image.name}&sigma_m={SIGMA_M}"
-    scene = client.post(name, content=image.read_bytes(), headers=me).json()["id"]
+    scene = me.post(name, content=image.read_bytes()).json()["id"]
     few = register("register-scene", scene=scene, options={"max_points": 90})
     assert few["status"] == "successful", few
     execution = "/processes/renew-block/execution"
     body: dict[str, Any] = {"inputs": {"block": "flat", "jobs": [few["jobID"]]}}
-    assert client.post(execution, json=body, headers=me).status_code == 403
+    assert me.post(execution, json=body).status_code == 403
     for wrong, status in (
         ({"block": "none"}, 404),
         ({"jobs": []}, 422),
@@ -417,21 +417,19 @@ def test_an_administrator_renews_a_block_by_a_job(
         ({"jobs": [scene]}, 404),
         ({"version": "1"}, 409),
     ):
-        reply = client.post(execution, json={"inputs": {**body["inputs"], **wrong}}, headers=admin)
+        reply = admin.post(execution, json={"inputs": {**body["inputs"], **wrong}})
         assert reply.status_code == status, reply.text
     renew = job_runner(client, database, settings, admin)
     job = renew("renew-block", **body["inputs"])
     assert job["status"] == "successful", job
-    results = client.get(f"/jobs/{job['jobID']}/results", headers=admin).json()
+    results = admin.get(f"/jobs/{job['jobID']}/results").json()
     assert (results["id"], results["version"], results["state"]) == ("flat", "2", "staged")
     with database.reading() as connection:
         assert [block.priority for block, _ in list_blocks(driver(connection))] == [3, 3]
-    document = client.get(results["renewal.json"]["href"], headers=admin).json()
+    document = admin.get(results["renewal.json"]["href"]).json()
     assert document["new_views"] == results["new_views"]
     # All points get views, not only the ninety that the registration tried.
     assert document["points_with_new_views"] > 0.85 * POINTS
-    of_itself = client.post(
-        execution, json={"inputs": {"block": "flat", "jobs": [job["jobID"]]}}, headers=admin
-    )
+    of_itself = admin.post(execution, json={"inputs": {"block": "flat", "jobs": [job["jobID"]]}})
     assert of_itself.status_code == 422
     assert f"job {job['jobID']}: is of the process renew-block" in of_itself.json()["detail"]

@@ -16,7 +16,6 @@ from amers.app.db import blocks, engine
 from amers.app.db.engine import Database
 from amers.app.db.points import points_of_block
 from amers.app.storage import Storage
-from amers.app.usecases.blocks import lifecycle
 from amers.services.formats.block.document_json import parse_block_json
 from amers.services.formats.block.writer import write_block
 from amers.services.formats.images.raster import write_raster
@@ -24,6 +23,7 @@ from amers.services.geodesy import east_north_up
 from amers.services.types import Array, ControlPoints, point_chips
 from tests.app.callers import Bearer
 from tests.app.ledger import job_runner
+from tests.app.served import serve_block
 from tests.factories import metadata
 from tests.services.block_with_hole import HOLE_M, PER_KM2, SIGMA_M, older, simulated
 
@@ -45,8 +45,7 @@ def publish_block_with_hole(dsn: str, storage: Storage, folder: Path) -> Array:
         {},
     )
     with engine.connect(dsn) as connection:
-        ingested = lifecycle.ingest_block(connection, storage, folder).block
-        lifecycle.publish_block(connection, str(ingested.number))
+        serve_block(connection, storage, folder)
     return outline
 
 
@@ -95,7 +94,7 @@ def holed(
         image = tmp_path / f"later_{number}.tif"
         write_raster(image, view.pixels, view.geometry.delivered)
         address = f"/scenes?name={image.name}&sigma_m={SIGMA_M}"
-        scene = client.post(address, content=image.read_bytes(), headers=admin).json()["id"]
+        scene = admin.post(address, content=image.read_bytes()).json()["id"]
         registered = run("register-scene", scene=scene, options={"max_points": 0})
         assert registered["status"] == "successful", registered
         jobs.append(registered["jobID"])

@@ -8,13 +8,12 @@ from fastapi.testclient import TestClient
 
 from amers.app.config import Settings
 from amers.app.main import create_app
-from tests.app.callers import Bearer
+from tests.app.callers import Bearer, Caller
+from tests.app.sending import PIECE, TUS, begun
 
 pytestmark = pytest.mark.security
 
 TIFF = b"II*\0" + bytes(100)
-TUS = {"Tus-Resumable": "1.0.0"}
-PIECE = {"Content-Type": "application/offset+octet-stream"}
 
 
 def operations(client: TestClient) -> Iterator[tuple[str, str]]:
@@ -43,10 +42,9 @@ def test_every_reply_forbids_guesses_of_its_type_and_storing(client: TestClient,
         assert client.get(path).headers["cache-control"] == "no-store"
 
 
-def test_files_are_not_stored_and_not_guessed(client: TestClient, bearer: Bearer):
-    me = bearer("register")
-    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()["id"]
-    reply = client.get(f"/scenes/{scene}/files/a.tif", headers=me)
+def test_files_are_not_stored_and_not_guessed(me: Caller):
+    scene = me.post("/scenes?name=a.tif", content=TIFF).json()["id"]
+    reply = me.get(f"/scenes/{scene}/files/a.tif")
     assert reply.content == TIFF
     assert reply.headers["cache-control"] == "no-store"
     assert reply.headers["x-content-type-options"] == "nosniff"
@@ -71,7 +69,7 @@ def test_the_reply_to_an_unexpected_error_has_the_headers_too(settings: Settings
 
 
 def test_tiles_and_the_map_keep_their_own_caching(client: TestClient, bearer: Bearer):
-    tile = client.get("/collections/points/tiles/WebMercatorQuad/0/0/0", headers=bearer("read"))
+    tile = bearer("read").get("/collections/points/tiles/WebMercatorQuad/0/0/0")
     assert (tile.status_code, tile.headers["cache-control"]) == (200, "private, no-cache")
     headers = bearer("read") | {"If-None-Match": tile.headers["etag"]}
     again = client.get("/collections/points/tiles/WebMercatorQuad/0/0/0", headers=headers)
@@ -127,20 +125,8 @@ def test_a_public_name_is_accepted_where_the_settings_name_it(
         assert f"http://{host}/" in reply.text, "links have the name that the caller uses"
 
 
-def begun(client: TestClient, me: dict[str, str]) -> str:
-    reply = client.post(
-        "/uploads",
-        headers=me | TUS | {"Upload-Length": str(len(TIFF)), "Upload-Metadata": "filename YS50aWY="},
-    )
-    assert reply.status_code == 201, reply.text
-    return reply.headers["location"]
-
-
-def test_replies_to_uploads_name_the_version_of_tus_whatever_they_say(
-    client: TestClient, bearer: Bearer
-):
-    me = bearer("register")
-    url = begun(client, me)
+def test_replies_to_uploads_name_the_version_of_tus_whatever_they_say(client: TestClient, me: Caller):
+    url = begun(me, len(TIFF), filename="a.tif").headers["location"]
     offset = {"Upload-Offset": "5"}
     replies = {
         400: client.patch(
@@ -150,7 +136,7 @@ def test_replies_to_uploads_name_the_version_of_tus_whatever_they_say(
         404: client.head("/uploads/no-id", headers=me | TUS),
         405: client.put(url, headers=me | TUS),
         409: client.patch(url, content=b"x", headers=me | TUS | PIECE | offset),
-        412: client.head(url, headers=me),
+        412: me.head(url),
         413: client.patch(url, content=TIFF * 2, headers=me | TUS | PIECE | {"Upload-Offset": "0"}),
         415: client.patch(url, content=b"x", headers=me | TUS | offset),
     }
@@ -158,9 +144,9 @@ def test_replies_to_uploads_name_the_version_of_tus_whatever_they_say(
         assert (reply.status_code, reply.headers.get("tus-resumable")) == (status, "1.0.0"), reply.text
 
 
-def test_a_post_stands_for_the_method_that_its_header_names(client: TestClient, bearer: Bearer):
-    me = bearer("register") | TUS
-    url = begun(client, me)
+def test_a_post_stands_for_the_method_that_its_header_names(client: TestClient, me: Caller):
+    me = me | TUS
+    url = begun(me, len(TIFF), filename="a.tif").headers["location"]
 
     def override(method: str, **more: str) -> dict[str, str]:
         return me | {"X-HTTP-Method-Override": method} | more
@@ -177,11 +163,10 @@ def test_a_post_stands_for_the_method_that_its_header_names(client: TestClient, 
     assert "PATCH" in wrong.json()["detail"]
 
 
-def test_no_other_path_and_no_other_method_is_overridden(client: TestClient, bearer: Bearer):
-    me = bearer("register") | {"X-HTTP-Method-Override": "DELETE"}
-    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()["id"]
-    url = begun(client, {"Authorization": me["Authorization"]})
-    assert client.post(f"/scenes/{scene}", headers=me).status_code == 405
-    assert client.get(url, headers=me).json()["state"] == "arriving"
-    assert client.get(url, headers=me).status_code == 200
-    assert client.get(f"/scenes/{scene}", headers=me).status_code == 200
+def test_no_other_path_and_no_other_method_is_overridden(me: Caller):
+    url = begun(me, len(TIFF), filename="a.tif").headers["location"]
+    overriding = me | {"X-HTTP-Method-Override": "DELETE"}
+    scene = overriding.scene(TIFF, "name=a.tif")
+    assert overriding.post(f"/scenes/{scene}").status_code == 405
+    assert overriding.get(url).json()["state"] == "arriving"
+    assert overriding.get(f"/scenes/{scene}").status_code == 200

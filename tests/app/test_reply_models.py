@@ -7,7 +7,7 @@ import jsonschema
 import pytest
 from fastapi.testclient import TestClient
 
-from amers.app.usecases.blocks import lifecycle
+from tests.app.served import serve_block
 from tests.factories import make_block
 from tests.statements import run_sql
 
@@ -19,16 +19,15 @@ Check = Callable[[str, str], dict[str, Any]]
 @pytest.fixture
 def check(client: TestClient, bearer, connection, storage, tmp_path) -> Check:
     """Gets a path of a store with a block and a scene; checks the reply against a schema of the API."""
-    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", count=20).folder)
-    lifecycle.publish_block(connection, "calanques")
+    serve_block(connection, storage, make_block(tmp_path / "block", count=20).folder)
     run_sql(connection, "insert into point_history (point_id) select id from point limit 3")
     connection.commit()
-    headers = bearer("admin")
-    assert client.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100), headers=headers).is_success
+    caller = bearer("admin")
+    assert caller.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100)).is_success
     components = client.get("/api").json()["components"]
 
     def check(path: str, name: str) -> dict[str, Any]:
-        reply = client.get(path, headers=headers)
+        reply = caller.get(path)
         assert reply.status_code == 200, reply.text
         schema = {"$ref": f"#/components/schemas/{name}", "components": closed(components)}
         jsonschema.validate(reply.json(), schema)

@@ -15,8 +15,8 @@ from amers.app.storage import Storage
 from amers.app.usecases.results import result_key
 from amers.app.usecases.tokens import create_token
 from amers.app.worker.sweep import sweep_files, sweep_records
-from tests.app.job_queue import claim, store_registration
-from tests.statements import run_sql
+from tests.app.job_queue import claim, requested, store_registration
+from tests.statements import run_in, run_sql
 
 OLDER = (
     "update job set finished_at = finished_at - make_interval(days => %s)",
@@ -36,14 +36,12 @@ def clock_jumps(database: Database, days: int) -> None:
 def service_runs(database: Database, days: int) -> None:
     """Let the service run for days."""
     clock_jumps(database, days)
-    with database.transaction() as connection:
-        run_sql(connection, "update uptime set elapsed_s = elapsed_s + 86400 * %s", [days])
+    run_in(database.transaction(), "update uptime set elapsed_s = elapsed_s + 86400 * %s", [days])
 
 
 def running_job(connection: Connection, storage: Storage) -> tuple[UUID, str]:
     """A registration job that has written a file of 100 bytes, and the key of the file."""
-    job = jobs.create(connection, "register-scene", {})
-    assert job is not None
+    job = requested(connection, "register-scene", {})
     assert claim(connection, job.id)
     attempts.reserve_results(connection, job.id, 1, 100)
     return job.id, storage.put(f"results/{job.id}/1/report.json", [bytes(100)]).key
@@ -87,8 +85,7 @@ def test_results_then_jobs_are_removed_by_default_and_the_registration_stays(
     service_runs(database, 275)
     sweep_records(database, storage, settings)
     assert find(database, job_id) is None
-    with database.transaction() as connection:
-        row = run_sql(connection, "select job_id, files, verdict from registration").fetchone()
+    (row,) = run_in(database.transaction(), "select job_id, files, verdict from registration")
     assert row == {"job_id": None, "files": {}, "verdict": "good"}
 
 
@@ -144,8 +141,7 @@ def test_the_oldest_jobs_are_deleted_first(
     ended = []
     with database.transaction() as connection:
         for _ in range(4):
-            job = jobs.create(connection, "register-scene", {})
-            assert job is not None
+            job = requested(connection, "register-scene", {})
             jobs.dismiss(connection, job.id)
             ended.append(job.id)
     service_runs(database, 400)
@@ -164,8 +160,7 @@ def test_a_job_that_goes_on_is_not_deleted_with_those_that_have_ended(database: 
 
 def test_a_size_that_is_recorded_meanwhile_is_not_replaced_by_a_measured_one(database: Database):
     with database.transaction() as connection:
-        job = jobs.create(connection, "register-scene", {})
-        assert job is not None
+        job = requested(connection, "register-scene", {})
         for before, after in ((None, 7), (100, 100)):
             run_sql(connection, "update job set results_bytes = %s", [before])
             jobs.set_measured(connection, job.id, 7)
@@ -187,11 +182,9 @@ def test_results_stored_before_sizes_were_recorded_are_measured(
     database: Database, storage: Storage, settings: Settings
 ):
     job_id = successful_job(database, storage)
-    with database.transaction() as connection:
-        run_sql(connection, "update job set results_bytes = null")
+    run_in(database.transaction(), "update job set results_bytes = null")
     sweep_records(database, storage, settings)
-    with database.transaction() as connection:
-        row = run_sql(connection, "select results_bytes from job where id = %s", [job_id]).fetchone()
+    (row,) = run_in(database.transaction(), "select results_bytes from job where id = %s", [job_id])
     assert row == {"results_bytes": 100}
 
 
@@ -273,8 +266,7 @@ def test_the_audit_gives_up_nothing_but_its_oldest_rows(
 
 def test_a_removed_job_leaves_its_owner_in_the_audit(connection: Connection, database: Database):
     owner = create_token(connection, "owner", ["register"]).token
-    job = jobs.create(connection, "register-scene", {}, owner.id)
-    assert job is not None
+    job = requested(connection, "register-scene", {}, owner.id)
     connection.commit()
     with working_for(Origin(actor_name="worker", job_id=job.id)), database.transaction() as own:
         jobs.dismiss(own, job.id)

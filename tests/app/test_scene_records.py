@@ -13,7 +13,7 @@ from amers.app.db.scene_files import SceneFiles, read_scene_files
 from amers.app.db.scene_registrations import SceneRegistration, last_registrations
 from amers.app.usecases.stored_scenes import stored_scenes
 from amers.app.usecases.tokens import create_token
-from tests.app.job_queue import claim, store_registration
+from tests.app.job_queue import claim, requested, store_registration
 from tests.statements import run_sql
 
 
@@ -42,8 +42,7 @@ def asked(connection: Connection, owner: UUID, *scene_ids: UUID) -> UUID:
     kind, inputs = ("register-scenes", {"scenes": names})
     if len(names) == 1:
         kind, inputs = "register-scene", {"scene": names[0]}
-    job = jobs.create(connection, kind, inputs, owner)
-    assert job is not None
+    job = requested(connection, kind, inputs, owner)
     assert claim(connection, job.id)
     return job.id
 

@@ -9,7 +9,7 @@ from fastapi.testclient import TestClient
 
 from amers.app.config import Settings
 from amers.app.db.engine import Database
-from tests.app.callers import Bearer
+from tests.app.callers import Bearer, Caller
 from tests.app.ledger import job_runner, make_token
 from tests.app.test_orthorectification import write_inputs
 
@@ -20,14 +20,14 @@ def test_the_tiles_of_a_scene_are_read_by_ranges(
     settings: Settings,
     database: Database,
     tmp_path: Path,
+    me: Caller,
 ) -> None:
     image, _ = write_inputs(tmp_path)
-    me = bearer("register")
-    scene = client.post("/scenes?name=scene.tif", content=image.read_bytes(), headers=me).json()["id"]
+    scene = me.post("/scenes?name=scene.tif", content=image.read_bytes()).json()["id"]
     ended = job_runner(client, database, settings, me)("view-scene", scene=scene)
     assert ended["status"] == "successful", str(ended)
-    answer = client.get(f"/jobs/{ended['jobID']}/results", headers=me).json()
-    index = client.get(answer["tiles.json"]["href"], headers=me).json()
+    answer = me.get(f"/jobs/{ended['jobID']}/results").json()
+    index = me.get(answer["tiles.json"]["href"]).json()
     with rasterio.open(image) as raw:
         pixels = raw.read(1).astype(float)
     assert (index["lines"], index["samples"]) == pixels.shape == (answer["lines"], answer["samples"])

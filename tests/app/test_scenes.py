@@ -26,8 +26,9 @@ from amers.app.worker.sweep import sweep_files
 from tests.app.callers import Bearer, Caller
 from tests.app.conftest import stored_files
 from tests.app.running_service import running_service
+from tests.app.sending import begun
 from tests.app.worker_processes import wait_until
-from tests.statements import run_sql
+from tests.statements import run_in, run_sql
 
 TIFF = b"II*\0" + bytes(100_000)
 LIMIT_BYTES = 200_000
@@ -45,9 +46,7 @@ def chunks(data: bytes) -> Iterator[bytes]:
         yield data[start : start + 10_000]
 
 
-def test_pages_of_scenes_have_every_scene_once(
-    client: TestClient, me: Caller, bearer: Bearer, connection: Connection
-):
+def test_pages_of_scenes_have_every_scene_once(me: Caller, bearer: Bearer, connection: Connection):
     """Two scenes of the same instant fall on different pages, and a new one on none of those to come."""
     mine = {me.scene(TIFF[:9]) for _ in range(5)}
     foreign = bearer("register").scene(TIFF[:9])
@@ -67,10 +66,7 @@ def test_pages_of_scenes_have_every_scene_once(
     assert me.get("/scenes?after=scene").status_code == 400
 
 
-def test_an_uploaded_scene_is_stored_as_it_was_sent(
-    client: TestClient, bearer: Bearer, storage: Storage
-):
-    me = bearer("register")
+def test_an_uploaded_scene_is_stored_as_it_was_sent(me: Caller, storage: Storage):
     reply = me.post("/scenes?name=IMG_1.TIF&sigma_m=12.5", content=TIFF)
     assert reply.status_code == 201, reply.text
     scene = reply.json()
@@ -87,8 +83,7 @@ def test_the_name_may_come_from_the_content_disposition(client: TestClient, bear
     assert (reply.json()["name"], reply.json()["file"]) == ("scène 1.tif", "scene_1.tif")
 
 
-def test_a_model_is_laid_beside_the_image(client: TestClient, bearer: Bearer, storage: Storage):
-    me = bearer("register")
+def test_a_model_is_laid_beside_the_image(me: Caller, storage: Storage):
     scene = me.post("/scenes?name=a.tif", content=TIFF).json()
     reply = me.put(f"/scenes/{scene['id']}/files/a_RPC.TXT", content=b"LINE_OFF: 1")
     assert reply.status_code == 200, reply.text
@@ -99,51 +94,13 @@ def test_a_model_is_laid_beside_the_image(client: TestClient, bearer: Bearer, st
 @pytest.mark.parametrize(
     ("name", "status"), [("a.tif", 409), ("a.vrt", 422), ("a.aux.xml.sh", 422), ("...", 422)]
 )
-def test_only_models_are_laid_beside_an_image(
-    client: TestClient, bearer: Bearer, name: str, status: int
-):
-    me = bearer("register")
+def test_only_models_are_laid_beside_an_image(me: Caller, name: str, status: int):
     scene = me.post("/scenes?name=a.tif", content=TIFF).json()
     reply = me.put(f"/scenes/{scene['id']}/files/{name}", content=b"x")
     assert reply.status_code == status, reply.text
 
 
-@pytest.mark.parametrize("body", [b"", b"II", b"<VRTDataset/>", b"\x89PNG\r\n\x1a\n", b"PK\3\4"])
-def test_a_file_that_is_no_image_is_refused_and_leaves_nothing(
-    client: TestClient, bearer: Bearer, storage: Storage, body: bytes
-):
-    me = bearer("register")
-    reply = me.post("/scenes?name=a.tif", content=body)
-    assert reply.status_code == 422
-    assert "neither TIFF, JPEG 2000 nor NITF" in reply.json()["detail"]
-    assert me.get("/scenes").json()["scenes"] == []
-    assert stored_files(storage) == []
-
-
-def test_an_upload_announced_too_large_is_refused_before_it_is_read(
-    client: TestClient, bearer: Bearer, storage: Storage
-):
-    me = bearer("register")
-    size = {"Content-Length": str(LIMIT_BYTES + 1)}
-    reply = client.post("/scenes?name=a.tif", content=b"II*\0", headers=me | size)
-    assert reply.status_code == 413
-    assert me.get("/scenes").json()["scenes"] == []
-    assert stored_files(storage) == []
-
-
-def test_an_upload_that_turns_out_too_large_is_cut_off_and_leaves_nothing(
-    client: TestClient, bearer: Bearer, storage: Storage
-):
-    me = bearer("register")
-    body = chunks(TIFF + bytes(LIMIT_BYTES))
-    reply = me.post("/scenes?name=a.tif", content=body)
-    assert reply.status_code == 413
-    assert str(LIMIT_BYTES) in reply.json()["detail"]
-    assert me.get("/scenes").json()["scenes"] == []
-    assert stored_files(storage) == []
-
-
-def test_an_upload_without_announced_length_arrives(client: TestClient, bearer: Bearer):
+def test_an_upload_without_announced_length_arrives(bearer: Bearer):
     reply = bearer("register").post("/scenes?name=a.tif", content=chunks(TIFF))
     assert reply.json()["size_bytes"] == len(TIFF)
 
@@ -164,30 +121,43 @@ def test_a_checksum_that_fits_is_accepted(client: TestClient, bearer: Bearer, he
     assert reply.status_code == 201, reply.text
 
 
+NO_IMAGE = "neither TIFF, JPEG 2000 nor NITF"
+
+
 @pytest.mark.parametrize(
-    "header",
+    ("body", "header", "status", "reason"),
     [
-        {"X-Checksum": bytes(32).hex()},
-        {"X-Checksum": "abc"},
-        {"Repr-Digest": f"sha-256=:{b64encode(bytes(32)).decode()}:"},
-        {"Repr-Digest": "sha-256=:AAAA:"},
+        *(
+            (body, {}, 422, NO_IMAGE)
+            for body in (b"", b"II", b"<VRTDataset/>", b"\x89PNG\r\n", b"PK\3\4")
+        ),
+        (b"II*\0", {"Content-Length": str(LIMIT_BYTES + 1)}, 413, f"{LIMIT_BYTES + 1} bytes announced"),
+        (TIFF + bytes(LIMIT_BYTES), {}, 413, f"larger than {LIMIT_BYTES} bytes"),
+        (TIFF, {"X-Checksum": bytes(32).hex()}, 422, "sha256"),
+        (TIFF, {"X-Checksum": "abc"}, 422, "X-Checksum"),
+        (TIFF, {"Repr-Digest": f"sha-256=:{b64encode(bytes(32)).decode()}:"}, 422, "sha256"),
+        (TIFF, {"Repr-Digest": "sha-256=:AAAA:"}, 422, "Repr-Digest"),
     ],
 )
-def test_a_checksum_that_does_not_fit_refuses_the_upload(
-    client: TestClient, bearer: Bearer, storage: Storage, header: dict[str, str]
+def test_an_upload_that_cannot_be_used_is_refused_and_leaves_nothing(
+    me: Caller, storage: Storage, body: bytes, header: dict[str, str], status: int, reason: str
 ):
-    reply = client.post("/scenes?name=a.tif", content=TIFF, headers=bearer("register") | header)
-    assert reply.status_code == 422
+    """What is no image, has another checksum, or is too large: announced so, or only when it arrives."""
+    content = chunks(body) if len(body) > LIMIT_BYTES else body
+    reply = (me | header).post("/scenes?name=a.tif", content=content)
+    assert reply.status_code == status
+    assert reason in reply.json()["detail"]
+    assert me.get("/scenes").json()["scenes"] == []
     assert stored_files(storage) == []
 
 
-def test_an_upload_without_a_name_is_refused(client: TestClient, bearer: Bearer):
+def test_an_upload_without_a_name_is_refused(bearer: Bearer):
     reply = bearer("register").post("/scenes", content=TIFF)
     assert reply.status_code == 422
     assert "no name" in reply.json()["detail"]
 
 
-def test_a_scene_of_another_owner_is_not_found(client: TestClient, bearer: Bearer, storage: Storage):
+def test_a_scene_of_another_owner_is_not_found(bearer: Bearer, storage: Storage):
     scene = bearer("register").post("/scenes?name=a.tif", content=TIFF).json()
     here = f"/scenes/{scene['id']}"
     stranger = bearer("register")
@@ -202,10 +172,7 @@ def test_a_scene_of_another_owner_is_not_found(client: TestClient, bearer: Beare
     assert bearer("admin").get(here).status_code == 200
 
 
-def test_a_removed_scene_keeps_its_record_and_loses_its_files(
-    client: TestClient, bearer: Bearer, storage: Storage
-):
-    me = bearer("register")
+def test_a_removed_scene_keeps_its_record_and_loses_its_files(me: Caller, storage: Storage):
     scene = me.post("/scenes?name=a.tif", content=TIFF).json()
     here = f"/scenes/{scene['id']}"
     me.put(f"{here}/files/a_RPC.TXT", content=b"x")
@@ -218,10 +185,9 @@ def test_a_removed_scene_keeps_its_record_and_loses_its_files(
 
 
 def test_a_removed_scene_takes_and_gives_no_more_files_and_counts_for_nobody(
-    client: TestClient, bearer: Bearer, connection: Connection, storage: Storage
+    me: Caller, connection: Connection, storage: Storage
 ):
     """Not even those that a deletion has left which broke off."""
-    me = bearer("register")
     scene = me.scene(TIFF, "name=a.tif")
     model = f"/scenes/{scene}/files/a_RPC.TXT"
     announced = {"filename": "b_RPC.TXT", "scene": scene}
@@ -236,13 +202,7 @@ def test_a_removed_scene_takes_and_gives_no_more_files_and_counts_for_nobody(
         storage.put(f"scenes/{scene}/{name}", [b"left"])
         assert me.get(f"/scenes/{scene}/files/{name}").status_code == 404
     assert me.put(model, content=b"LINE_OFF: 2").status_code == 409
-    words = (f"{name} {b64encode(of.encode()).decode()}" for name, of in announced.items())
-    headers = me | {
-        "Tus-Resumable": "1.0.0",
-        "Upload-Length": "1",
-        "Upload-Metadata": ",".join(words),
-    }
-    assert client.post("/uploads", headers=headers).status_code == 409
+    assert begun(me, 1, **announced).status_code == 409
     after = usage.read_usage(connection, owner)
     assert (after.scenes, after.total_bytes) == (0, 0)
 
@@ -260,8 +220,7 @@ def test_a_file_of_another_size_than_announced_leaves_nothing(
     assert usage.read_usage(connection, owner.id).total_bytes == 0
 
 
-def test_folders_in_a_sent_file_name_are_dropped(client: TestClient, bearer: Bearer, storage: Storage):
-    me = bearer("register")
+def test_folders_in_a_sent_file_name_are_dropped(me: Caller, storage: Storage):
     for name in ("../../../etc/passwd.tif", "/etc/cron.d/x.tif", "..\\..\\x.tif", ".hidden.tif"):
         reply = me.post("/scenes", params={"name": name}, content=TIFF)
         assert reply.status_code == 201, reply.text
@@ -309,8 +268,7 @@ def test_the_sweep_removes_what_uploads_cut_off_left_behind(client: TestClient, 
 
 def test_an_upload_survives_no_failure_of_the_database(settings: Settings, bearer: Bearer, dsn: str):
     me = bearer("register")
-    with engine.connect(dsn) as connection:
-        run_sql(connection, "alter table scene add constraint test_only check (state <> 'uploaded')")
+    run_in(engine.connect(dsn), "alter table scene add constraint test_only check (state <> 'uploaded')")
     with TestClient(create_app(settings), raise_server_exceptions=False) as client:
         reply = client.post("/scenes?name=a.tif", content=TIFF, headers=me)
         assert reply.status_code == 500
@@ -334,8 +292,7 @@ def test_an_upload_cut_off_by_its_sender_leaves_nothing(
             wait_until(lambda: list(unfinished.glob("*")), "the upload has begun", 20.0)
 
         def forgotten() -> bool:
-            with engine.connect(dsn) as connection:
-                row = run_sql(connection, "select count(*) as n from scene").fetchone()
+            (row,) = run_in(engine.connect(dsn), "select count(*) as n from scene")
             return row == {"n": 0}
 
         wait_until(forgotten, "the scene is forgotten", 20.0)

@@ -15,16 +15,15 @@ from amers.app.db.jobs import attempts
 from amers.app.errors import InputError
 from amers.app.main import create_app
 from amers.app.worker.attempt import Attempts
-from tests.app.callers import Bearer
-from tests.statements import run_sql
+from tests.app.callers import Caller
+from tests.statements import run_in
 
 FOREIGN = ("9999", "00001", "8f2c1d0b7a6e")
 """Of a newer Amers, and of other programs that use Alembic."""
 
 
 def set_revision(dsn: str, revision: str) -> None:
-    with engine.connect(dsn) as connection:
-        run_sql(connection, "update alembic_version set version_num = %s", [revision])
+    run_in(engine.connect(dsn), "update alembic_version set version_num = %s", [revision])
 
 
 @pytest.mark.parametrize("revision", FOREIGN)
@@ -61,18 +60,17 @@ def test_the_commands_end_with_the_reason(dsn: str, tmp_path: Path, command: tup
 
 
 def test_an_upgrade_under_a_running_service_is_noticed(
-    client: TestClient, bearer: Bearer, settings: Settings, dsn: str
+    client: TestClient, me: Caller, settings: Settings, dsn: str
 ):
-    me = bearer("register")
-    scene = client.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100), headers=me).json()["id"]
+    scene = me.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100)).json()["id"]
     body = {"inputs": {"scene": scene}}
-    job = client.post("/processes/register-scene/execution", json=body, headers=me).json()["jobID"]
+    job = me.post("/processes/register-scene/execution", json=body).json()["jobID"]
     database: Database = client.app.state.database  # type: ignore[attr-defined]
     worker = Attempts(database, cast(Any, None), settings, "a worker", lambda: False)
     set_revision(dsn, "9999")
     with pytest.raises(InputError, match="restart it"):
         worker.do_next_job()
-    assert client.get(f"/jobs/{job}", headers=me).json()["status"] == "accepted"
+    assert me.get(f"/jobs/{job}").json()["status"] == "accepted"
     ready = client.get("/readyz")
     assert ready.status_code == 503
     assert "9999" in ready.text

@@ -13,10 +13,10 @@ MERCATOR = "http://www.opengis.net/def/crs/EPSG/0/3857"
 @pytest.fixture
 def get(client, bearer):
     """GET as the owner of two scenes."""
-    headers = bearer("register")
+    caller = bearer("register")
     for name in ("a", "b"):
-        client.post(f"/scenes?name={name}.tif", content=b"II*\0" + bytes(100), headers=headers)
-    return lambda path, **parameters: client.get(path, params=parameters or None, headers=headers)
+        caller.post(f"/scenes?name={name}.tif", content=b"II*\0" + bytes(100))
+    return lambda path, **parameters: caller.get(path, params=parameters or None)
 
 
 def links(document):

@@ -12,7 +12,7 @@ from fastapi.testclient import TestClient
 from amers.app.config import Settings
 from amers.app.storage import Storage
 from amers.services.types import UNKNOWN_FRAME, Frame
-from tests.app.callers import Bearer
+from tests.app.callers import Bearer, Caller
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
 from tests.app.worker_processes import ended, running_worker
 from tests.command_line import amers_here, environment_of
@@ -88,28 +88,26 @@ def assert_shown(text: str, words: tuple[str, str]) -> None:
 
 def test_everything_about_a_registered_scene_states_both(
     client: TestClient,
-    bearer: Bearer,
+    me: Caller,
     settings: Settings,
     published: None,
     world: FlatWorld,
     is_known: bool,
     tmp_path: Path,
 ):
-    me = bearer("register")
     image = world.tagged.read_bytes()
-    scene = client.post(f"/scenes?name=a.tif&sigma_m={SIGMA_M}", content=image, headers=me).json()["id"]
+    scene = me.post(f"/scenes?name=a.tif&sigma_m={SIGMA_M}", content=image).json()["id"]
     execution = "/processes/register-scene/execution"
-    reply = client.post(execution, json={"inputs": {"scene": scene}}, headers=me)
+    reply = me.post(execution, json={"inputs": {"scene": scene}})
     with running_worker(settings, tmp_path / "log"):
         job = ended(client, reply.headers["location"], me)
     assert job["status"] == "successful", job
-    results = client.get(f"/jobs/{job['jobID']}/results", headers=me).json()
+    results = me.get(f"/jobs/{job['jobID']}/results").json()
     words = assert_stated(results, is_known)
     assert results["verdict_scope"] == SCOPE
 
     texts = {
-        name: client.get(results[name]["href"], headers=me).text
-        for name in ("report.json", "report.html", "report.txt")
+        name: me.get(results[name]["href"]).text for name in ("report.json", "report.html", "report.txt")
     }
     report = json.loads(texts["report.json"])
     assert assert_stated(report, is_known) == words
@@ -121,38 +119,38 @@ def test_everything_about_a_registered_scene_states_both(
         headline = text[text.index(verdict_line) :]
         assert_shown(headline, words)
 
-    item = client.get(f"/collections/scenes/items/{scene}", headers=me).json()["properties"]
+    item = me.get(f"/collections/scenes/items/{scene}").json()["properties"]
     assert assert_stated(item, is_known, "amers:") == words
     assert item["amers:verdict_scope"] == SCOPE
-    (found,) = client.get("/search?collections=scenes", headers=me).json()["features"]
+    (found,) = me.get("/search?collections=scenes").json()["features"]
     assert assert_stated(found["properties"], is_known, "amers:") == words
 
 
 def test_everything_about_a_block_and_its_points_states_both(
-    client: TestClient, bearer: Bearer, published: None, is_known: bool, amers: Callable[..., str]
+    bearer: Bearer, published: None, is_known: bool, amers: Callable[..., str]
 ):
     me = bearer("read")
-    words = assert_stated(client.get("/blocks/flat/quality", headers=me).json(), is_known)
+    words = assert_stated(me.get("/blocks/flat/quality").json(), is_known)
     for command in ("show", "quality"):
         assert assert_stated(json.loads(amers("block", command, "flat", "--json")), is_known) == words
         assert_shown(amers("block", command, "flat"), words)
     (listed,) = json.loads(amers("block", "list", "--json"))
     assert assert_stated(listed, is_known) == words
     assert all(part in amers("block", "list") for part in words)
-    document = client.get("/blocks/flat/quality", headers=me).json()
-    (block,) = client.get("/collections/blocks/items", headers=me).json()["features"]
+    document = me.get("/blocks/flat/quality").json()
+    (block,) = me.get("/collections/blocks/items").json()["features"]
     for name, of in (("relative", "relative_to_control_points"), ("on_the_earth", "on_the_earth")):
         for figure in ("ce90_m", "le90_m"):
             value = block["properties"][f"{name}_{figure}"]
             assert value == pytest.approx(document[of][figure], rel=1e-5) if value else not is_known
-    page = client.get("/collections/blocks/items?f=html", headers=me).text
+    page = me.get("/collections/blocks/items?f=html").text
     heads = [
         page.index(f">{name}_{figure}<") for name in STATED_NAMES for figure in ("ce90_m", "le90_m")
     ]
     assert heads == sorted(heads)
     assert page.count("<td>unknown</td>") == (0 if is_known else 2)
-    (point,) = client.get("/collections/points/items?limit=1", headers=me).json()["features"]
-    item = client.get(f"/collections/points/items/{point['id']}", headers=me).json()
+    (point,) = me.get("/collections/points/items?limit=1").json()["features"]
+    item = me.get(f"/collections/points/items/{point['id']}").json()
     assert_stated(item["properties"], is_known)
 
 

@@ -24,7 +24,7 @@ from amers.app.worker.sweep import Sweeper, sweep_files
 from tests.app.full_storage import FAMILIES, Full, another, contents, run_service
 from tests.app.running_service import running_service
 from tests.app.worker_processes import wait_until
-from tests.statements import run_sql
+from tests.statements import run_in
 from tests.unproven import unproven_storage
 
 JOB_S = 3600.0
@@ -163,8 +163,7 @@ def test_a_storage_that_is_not_mounted_gets_no_files_of_its_own(
 def test_a_storage_of_an_earlier_version_is_adopted_by_its_own_database(full: Full):
     storage = unproven_storage(full.settings)
     storage.delete(MARKER)
-    with engine.connect(full.dsn) as connection:
-        run_sql(connection, "update installation set storage_generation = 0")
+    run_in(engine.connect(full.dsn), "update installation set storage_generation = 0")
     with engine.opened(full.settings) as database:
         assert storage_identity.announce(database.transaction, storage)
         sweep_files(database, storage, JOB_S)

@@ -1,10 +1,7 @@
 """One quota over everything that a token keeps in the storage, in a folder and in a bucket."""
 
-import io
 import json
 import threading
-import zipfile
-from base64 import b64encode
 from collections.abc import Iterator
 from pathlib import Path
 from uuid import UUID
@@ -23,7 +20,6 @@ from amers.app.db.tokens import Token
 from amers.app.errors import TooLarge, TooMany
 from amers.app.storage import Storage
 from amers.app.usecases import quotas, results, storage_identity
-from amers.app.usecases.blocks import lifecycle
 from amers.app.usecases.installation import Installation
 from amers.app.usecases.scenes import SentFile, upload_scene, upload_side_file
 from amers.app.usecases.tokens import create_token
@@ -31,10 +27,11 @@ from tests.app.callers import Caller
 from tests.app.job_queue import claim
 from tests.app.ledger import bytes_in_ledger, bytes_in_storage, job_runner, make_token
 from tests.app.s3_server import running_bucket
+from tests.app.sending import TUS, begun, whole, zipped
+from tests.app.served import serve_block
 from tests.factories import BOX, make_block
 
 TIFF = b"II*\0" + bytes(996)
-TUS = {"Tus-Resumable": "1.0.0", "Content-Type": "application/offset+octet-stream"}
 PATIENCE_S = 30.0
 in_both = pytest.mark.parametrize("settings", ["folder", "bucket"], indirect=True)
 
@@ -61,34 +58,8 @@ def storage(settings: Settings, database: Database) -> Storage:
 @pytest.fixture
 def published(connection: Connection, storage: Storage, tmp_path: Path) -> None:
     """A published block, whose points can be exported."""
-    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block").folder)
-    lifecycle.publish_block(connection, "calanques")
+    serve_block(connection, storage, make_block(tmp_path / "block").folder)
     connection.commit()
-
-
-def zipped(**files: bytes) -> bytes:
-    """An archive; in names, `_` stands for a dot."""
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in files.items():
-            archive.writestr(name.replace("_", "."), data)
-    return out.getvalue()
-
-
-def announce(client: TestClient, me: Caller, size: int, name: str, **more: str):
-    """The reply to the announcement of a resumable upload."""
-    pairs = {"filename": name, **more}.items()
-    metadata = ",".join(f"{key} {b64encode(value.encode()).decode()}" for key, value in pairs)
-    headers = me | TUS | {"Upload-Length": str(size), "Upload-Metadata": metadata}
-    return client.post("/uploads", headers=headers)
-
-
-def send(client: TestClient, me: Caller, data: bytes, name: str, **more: str):
-    """The reply to the only piece of a resumable upload."""
-    announced = announce(client, me, len(data), name, **more)
-    assert announced.status_code == 201, announced.text
-    url = announced.headers["location"]
-    return client.patch(url, content=data, headers=me | TUS | {"Upload-Offset": "0"})
 
 
 def used_bytes(me: Caller, dsn: str) -> int:
@@ -112,7 +83,7 @@ def test_a_token_with_a_quota_of_one_byte_leaves_nothing_by_any_way(
     for body in (TIFF, iter([TIFF[:500], TIFF[500:]])):
         refused = me.post("/scenes?name=a.tif", content=body)
         assert refused.status_code == 413, refused.text
-    assert announce(client, me, 1000, "a.tif").status_code == 413
+    assert begun(me, 1000, filename="a.tif").status_code == 413
     scene = admin.scene(TIFF, "name=a.tif")
     side_file = me.put(f"/scenes/{scene}/files/a_RPC.TXT", content=b"x" * 10)
     assert side_file.status_code == 404, "the scene belongs to another token"
@@ -122,7 +93,7 @@ def test_a_token_with_a_quota_of_one_byte_leaves_nothing_by_any_way(
     assert (export["status"], export["error"]["error"]) == ("failed", "TooLarge")
     assert "of 1 bytes are used" in export["error"]["detail"]
 
-    assert announce(client, me, 1, "a.tif").status_code == 201
+    assert begun(me, 1, filename="a.tif").status_code == 201
     full = me.execute("export-block", {"bbox": BOX})
     assert full.status_code == 413, "the quota is full before the job begins"
     assert bytes_in_storage(storage) == 0
@@ -132,15 +103,15 @@ def test_a_token_with_a_quota_of_one_byte_leaves_nothing_by_any_way(
 def test_an_archive_counts_unpacked_and_is_refused_before_it_is_unpacked(
     client: TestClient, admin: Caller, storage: Storage, dsn: str
 ):
-    archive = zipped(a_tif=TIFF[:4] + bytes(200_000), a_RPC_TXT=b"x" * 100)
+    archive = zipped({"a.tif": TIFF[:4] + bytes(200_000), "a_RPC.TXT": b"x" * 100})
     assert len(archive) < 2000
     me = make_token(client, admin, storage_quota_bytes=100_000)
-    refused = send(client, me, archive, "a.zip")
+    refused = whole(me, archive, filename="a.zip")
     assert refused.status_code == 413
     assert "unpacked to 200" in refused.json()["detail"]
     assert (bytes_in_storage(storage), used_bytes(me, dsn)) == (0, 0)
     roomy = make_token(client, admin, storage_quota_bytes=200_200)
-    assert send(client, roomy, archive, "a.zip").status_code == 204
+    assert whole(roomy, archive, filename="a.zip").status_code == 204
     assert used_bytes(roomy, dsn) == bytes_in_storage(storage) == 200_104
 
 
@@ -158,9 +129,7 @@ def test_files_beside_a_scene_count_for_its_owner(
     assert chunked.status_code == 200
     by_admin = admin.put(f"/scenes/{scene}/files/c_RPC.TXT", content=b"x" * 100)
     assert by_admin.status_code == 413, "the bytes count for the owner, whoever sends them"
-    name, of = b64encode(b"c_RPC.TXT").decode(), b64encode(scene.encode()).decode()
-    announced = {"Upload-Length": "100", "Upload-Metadata": f"filename {name},scene {of}"}
-    by_admin = client.post("/uploads", headers=admin | TUS | announced)
+    by_admin = begun(admin, 100, filename="c_RPC.TXT", scene=scene)
     assert by_admin.status_code == 413, "however they are sent"
     assert used_bytes(me, dsn) == bytes_in_storage(storage) == 1440
 
@@ -177,10 +146,10 @@ def test_a_scene_has_no_more_side_files_than_allowed(admin: Caller, monkeypatch:
 
 def test_a_token_has_no_more_open_uploads_than_allowed(client: TestClient, admin: Caller):
     me = make_token(client, admin)
-    statuses = [announce(client, me, 10, "a.tif").status_code for _ in range(3)]
+    statuses = [begun(me, 10, filename="a.tif").status_code for _ in range(3)]
     assert statuses == [201, 201, 429]
-    url = announce(client, admin, 10, "a.tif").headers["location"]
-    assert client.delete(url, headers=admin | TUS).status_code == 204, "others are not affected"
+    url = begun(admin, 10, filename="a.tif").headers["location"]
+    assert (admin | TUS).delete(url).status_code == 204, "others are not affected"
 
 
 def test_a_token_keeps_no_more_jobs_than_allowed_and_can_remove_them(client: TestClient, admin: Caller):
@@ -385,16 +354,16 @@ def test_the_ledger_equals_the_storage_after_a_mixed_run(
         for scene in (kept, removed):
             for content in (b"x" * 300, b"x" * 200):
                 me.put(f"/scenes/{scene}/files/a_RPC.TXT", content=content)
-        assert send(client, me, b"x" * 50, "b_RPC.TXT", scene=kept).status_code == 204
-        assert send(client, me, TIFF, "b.tif").status_code == 204
-        archive = zipped(c_tif=TIFF + bytes(9000), c_RPC_TXT=b"x")
-        assert send(client, me, archive, "c.zip").status_code == 204
+        assert whole(me, b"x" * 50, filename="b_RPC.TXT", scene=kept).status_code == 204
+        assert whole(me, TIFF, filename="b.tif").status_code == 204
+        archive = zipped({"c.tif": TIFF + bytes(9000), "c_RPC.TXT": b"x"})
+        assert whole(me, archive, filename="c.zip").status_code == 204
         assert me.post("/scenes?name=a.tif", content=b"no image").status_code == 422
         assert me.delete(f"/scenes/{removed}").status_code == 204
         run = job_runner(client, database, settings, me)
         run("export-block", bbox=BOX)
         run("export-block", bbox=(50.0, 43.0, 51.0, 44.0))
-    archive = zipped(block_json=b"{}")
+    archive = zipped({"block.json": b"{}"})
     assert admin.put("/blocks/uploads/b.zip", content=archive).status_code < 300
     assert admin.put("/blocks/uploads/b.zip", content=iter([archive])).status_code < 300
     with engine.connect(dsn) as connection:
@@ -419,7 +388,7 @@ def test_usage_is_shown_to_callers_administrators_and_operators(
 ):
     me = make_token(client, admin, storage_quota_bytes=4000)
     assert me.post("/scenes?name=a.tif", content=TIFF).status_code == 201
-    assert announce(client, me, 600, "b.tif").status_code == 201
+    assert begun(me, 600, filename="b.tif").status_code == 201
     (chips,) = storage.keys("chips")
     stray = storage.put(f"scenes/{UUID(int=1)}/stray.tif", [bytes(70)])
     stray_chips = storage.put(f"chips/{'0' * 64}.npy", [bytes(5)])

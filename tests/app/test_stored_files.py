@@ -22,7 +22,7 @@ from amers.app.usecases.blocks import lifecycle
 from amers.app.usecases.damage import report_damage
 from amers.app.usecases.installation import Installation
 from amers.services.conventions import CHIP_SIZE
-from tests.app.job_queue import claim
+from tests.app.job_queue import claim, requested
 from tests.factories import make_block
 from tests.statements import run_sql
 
@@ -35,8 +35,7 @@ def named(connection: Connection) -> set[str]:
 
 def job_in(connection: Connection, state: str) -> UUID:
     """The id of a job that has come into a state with a file of results."""
-    job = jobs.create(connection, "register-scene", {})
-    assert job is not None
+    job = requested(connection, "register-scene", {})
     assert claim(connection, job.id)
     results = {"files": {"report.json": key_of(job.id)}}
     if state == "dismissed":

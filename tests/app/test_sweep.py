@@ -20,7 +20,7 @@ from fastapi.testclient import TestClient
 from amers.app.config import Settings
 from amers.app.db import blocks, engine, scenes, uptime
 from amers.app.db.engine import Database
-from amers.app.db.jobs import attempts, jobs
+from amers.app.db.jobs import attempts
 from amers.app.db.tokens import list_tokens
 from amers.app.db.uploads import LIFE_HOURS
 from amers.app.storage import Marker, Storage, read_marker, trash, write_marker
@@ -36,9 +36,10 @@ from amers.app.usecases.garbage_collection import (
 from amers.app.worker import sweep
 from amers.app.worker.sweep import MOST_BETWEEN_S, Sweeper, sweep_files, sweep_records
 from tests.app.callers import Bearer
+from tests.app.job_queue import requested
 from tests.app.point_history import jump, let_pass
 from tests.factories import make_block
-from tests.statements import run_sql
+from tests.statements import run_in, run_sql
 
 JOB_S = 3600.0
 A_YEAR_H = 8760
@@ -142,9 +143,7 @@ def test_an_abandoned_upload_is_deleted_after_a_day_of_running_time(
 
 def test_the_running_time_advances_little_at_a_jump_and_never_back(database: Database, storage: Storage):
     def elapsed_s() -> float:
-        with database.transaction() as connection:
-            row = run_sql(connection, "select uptime_s() as ran").fetchone()
-        assert row is not None
+        (row,) = run_in(database.transaction(), "select uptime_s() as ran")
         return float(row["ran"])
 
     before = elapsed_s()
@@ -220,13 +219,12 @@ def test_an_hour_or_nearly_two_between_sweeps_is_running_time_and_more_is_a_jump
     """One sweep of files may have failed: that they come every hour is no promise."""
 
     def counted_s(seconds: float) -> float:
-        with database.transaction() as connection:
-            run_sql(
-                connection,
-                "update uptime set elapsed_s = 0,"
-                " advanced_at = clock_timestamp() - make_interval(secs => %s)",
-                [seconds],
-            )
+        run_in(
+            database.transaction(),
+            "update uptime set elapsed_s = 0,"
+            " advanced_at = clock_timestamp() - make_interval(secs => %s)",
+            [seconds],
+        )
         sweep_files(database, storage, JOB_S)
         with database.transaction() as connection:
             return uptime.today(connection)[1]
@@ -261,8 +259,7 @@ def test_files_of_the_attempt_that_counts_stay_however_deep_and_others_of_its_jo
     database: Database, storage: Storage
 ):
     with database.transaction() as connection:
-        job = jobs.create(connection, "register-scene", {})
-        assert job is not None
+        job = requested(connection, "register-scene", {})
         assert attempts.claim_next(connection, "w", 30.0)
     for name in ("1/report.json", "1/chips/0000.npy", "2/report.json", "11/report.json", "report.json"):
         storage.put(f"results/{job.id}/{name}", [b"{}"])
@@ -316,8 +313,7 @@ def test_no_results_are_removed_from_a_storage_of_another_installation(
     database: Database, storage: Storage, settings: Settings
 ):
     with database.transaction() as connection:
-        job = jobs.create(connection, "register-scene", {})
-        assert job is not None
+        job = requested(connection, "register-scene", {})
         attempts.claim_next(connection, "w", 30.0)
         key = storage.put(f"results/{job.id}/1/a", [b"x"]).key
         attempts.reserve_results(connection, job.id, 1, 1)

@@ -76,15 +76,14 @@ def test_an_expired_token_is_refused(connection):
         authenticate(connection, new.secret)
 
 
-def test_a_name_of_a_valid_token_is_refused_over_the_api(client, bearer):
-    admin = bearer("admin")
+def test_a_name_of_a_valid_token_is_refused_over_the_api(admin):
     body = {"name": "survey office", "scopes": ["read"]}
-    made = client.post("/tokens", json=body, headers=admin)
-    again = client.post("/tokens", json=body, headers=admin)
+    made = admin.post("/tokens", json=body)
+    again = admin.post("/tokens", json=body)
     assert (made.status_code, again.status_code) == (201, 409)
     assert f"{made.json()['id']} is named 'survey office' already" in again.json()["detail"]
-    client.delete(f"/tokens/{made.json()['id']}", headers=admin)
-    assert client.post("/tokens", json=body, headers=admin).status_code == 201
+    admin.delete(f"/tokens/{made.json()['id']}")
+    assert admin.post("/tokens", json=body).status_code == 201
 
 
 def test_a_token_is_revoked_by_name_only_when_the_name_is_unique(connection):

@@ -19,7 +19,7 @@ from amers.app.db import engine
 from amers.app.db.features import pages as features
 from amers.app.main import create_app
 from amers.app.storage import Storage
-from amers.app.usecases.blocks.lifecycle import ingest_block, publish_block
+from tests.app.served import serve_block
 from tests.factories import make_block
 
 PATIENCE_S = 30.0
@@ -132,8 +132,7 @@ def test_a_slow_reader_gives_the_only_connection_back_and_still_gets_everything(
     settings = Settings(database_url=dsn, data_folder=tmp_path / "data", pool_size=1)
     with engine.connect(dsn) as connection:
         made = make_block(tmp_path / "block", count=POINTS)
-        ingest_block(connection, Storage(settings.data_folder / "storage"), made.folder)
-        publish_block(connection, "calanques")
+        serve_block(connection, Storage(settings.data_folder / "storage"), made.folder)
     app = create_app(settings)
     headers = bearer("read")
     scope = {

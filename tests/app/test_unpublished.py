@@ -82,15 +82,13 @@ def content(reply: httpx.Response) -> object:
 
 
 @pytest.mark.parametrize("role", [READ, ADMIN])
-def test_a_point_is_served_by_its_id_while_its_block_is_published(
-    staged, published, client, bearer, role
-):
-    headers = bearer(role)
+def test_a_point_is_served_by_its_id_while_its_block_is_published(staged, published, bearer, role):
+    caller = bearer(role)
 
     def statuses() -> dict[str, int]:
-        found = {way: client.get(way, headers=headers).status_code for way in paths(staged, OF_A_POINT)}
+        found = {way: caller.get(way).status_code for way in paths(staged, OF_A_POINT)}
         body = {"ids": [int(staged["served"])]}
-        return {**found, "post": client.post(CHIPS, json=body, headers=headers).status_code}
+        return {**found, "post": caller.post(CHIPS, json=body).status_code}
 
     hidden = statuses()
     assert set(hidden.values()) == {404}, hidden

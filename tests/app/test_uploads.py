@@ -6,7 +6,6 @@ import socket
 import tarfile
 import threading
 import time
-import zipfile
 from base64 import b64encode
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -40,13 +39,12 @@ from tests.app.callers import Bearer, Caller
 from tests.app.conftest import stored_files
 from tests.app.ledger import bytes_in_ledger, bytes_in_storage, make_token
 from tests.app.point_history import let_pass
+from tests.app.sending import PIECE, TUS, begun, piece, said, whole, zipped
 from tests.services.formats.statements.scene_files import til
 from tests.statements import run_sql
 
 TIFF = b"II*\0" + np.random.default_rng(1).bytes(300_000)
 LIMIT_BYTES = 400_000
-TUS = {"Tus-Resumable": "1.0.0"}
-PIECE = {"Content-Type": "application/offset+octet-stream"}
 BREAKS = 10
 
 
@@ -57,7 +55,7 @@ def settings(dsn: str, tmp_path: Path) -> Settings:
 
 
 @pytest.fixture
-def me(bearer: Bearer) -> dict[str, str]:
+def me(bearer: Bearer) -> Caller:
     return bearer("register") | TUS
 
 
@@ -75,29 +73,6 @@ def listening(settings: Settings) -> Iterator[str]:
     finally:
         server.should_exit = True
         thread.join()
-
-
-def said(**values: str) -> dict[str, str]:
-    """The `Upload-Metadata` header of a file."""
-    pairs = (f"{name} {b64encode(value.encode()).decode()}" for name, value in values.items())
-    return {"Upload-Metadata": ",".join(pairs)}
-
-
-def begun(client: TestClient, me: Caller, size: int, **values: str) -> httpx.Response:
-    return client.post("/uploads", headers=me | {"Upload-Length": str(size)} | said(**values))
-
-
-def piece(
-    client: TestClient, url: str, me: dict[str, str], start: int, data: bytes, **more: str
-) -> httpx.Response:
-    return client.patch(url, content=data, headers=me | PIECE | {"Upload-Offset": str(start)} | more)
-
-
-def whole(client: TestClient, me: Caller, data: bytes, **values: str) -> httpx.Response:
-    """The reply to the only piece of an upload."""
-    reply = begun(client, me, len(data), **values)
-    assert reply.status_code == 201, reply.text
-    return piece(client, reply.headers["location"], me, 0, data)
 
 
 @contextmanager
@@ -165,22 +140,20 @@ def test_the_service_reports_the_tus_extensions_it_supports(client: TestClient, 
     assert (refused.status_code, refused.headers["tus-version"]) == (412, "1.0.0")
 
 
-def test_an_image_and_the_file_with_its_model_become_one_scene(
-    client: TestClient, me: Caller, storage: Storage
-):
-    reply = begun(client, me, len(TIFF), filename="IMG.TIF", sigma_m="7.5")
+def test_an_image_and_the_file_with_its_model_become_one_scene(me: Caller, storage: Storage):
+    reply = begun(me, len(TIFF), filename="IMG.TIF", sigma_m="7.5")
     assert reply.headers["upload-expires"]
     scene = reply.headers["amers-scene"]
     assert me.get(f"/scenes/{scene}").json()["state"] == "uploading"
     assert me.delete(f"/scenes/{scene}").status_code == 409, "its upload is deleted"
-    model = begun(client, me, 4, filename="RPC_IMG.XML", scene=scene)
-    assert piece(client, model.headers["location"], me, 0, b"<a/>").status_code == 204
+    model = begun(me, 4, filename="RPC_IMG.XML", scene=scene)
+    assert piece(me, model.headers["location"], 0, b"<a/>").status_code == 204
     url = reply.headers["location"]
-    assert piece(client, url, me, 0, TIFF[:1000]).headers["upload-offset"] == "1000"
+    assert piece(me, url, 0, TIFF[:1000]).headers["upload-offset"] == "1000"
     reply_headers = me.head(url).headers
     assert (reply_headers["upload-offset"], reply_headers["upload-length"]) == ("1000", str(len(TIFF)))
     assert reply_headers["cache-control"] == "no-store"
-    assert piece(client, url, me, 1000, TIFF[1000:]).status_code == 204
+    assert piece(me, url, 1000, TIFF[1000:]).status_code == 204
     document = me.get(f"/scenes/{scene}").json()
     assert (document["state"], document["models"], document["sigma_m"]) == (
         "uploaded",
@@ -192,30 +165,30 @@ def test_an_image_and_the_file_with_its_model_become_one_scene(
 
 
 def test_a_piece_that_does_not_begin_where_the_file_ends_is_refused(client: TestClient, me: Caller):
-    url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
-    piece(client, url, me, 0, TIFF[:100])
+    url = begun(me, len(TIFF), filename="a.tif").headers["location"]
+    piece(me, url, 0, TIFF[:100])
     for start in (0, 99, 101):
-        assert piece(client, url, me, start, TIFF[start:200]).status_code == 409
+        assert piece(me, url, start, TIFF[start:200]).status_code == 409
     reply = client.patch(url, content=b"x", headers=me | {"Upload-Offset": "100"})
     assert reply.status_code == 415
-    assert piece(client, url, me, 100, TIFF).status_code == 413
+    assert piece(me, url, 100, TIFF).status_code == 413
     assert me.head(url).headers["upload-offset"] == "100"
 
 
-def test_a_piece_with_a_wrong_checksum_is_discarded(client: TestClient, me: Caller):
-    url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
+def test_a_piece_with_a_wrong_checksum_is_discarded(me: Caller):
+    url = begun(me, len(TIFF), filename="a.tif").headers["location"]
     for algorithm in ("sha1", "sha256"):
         start = int(me.head(url).headers["upload-offset"])
         data = TIFF[start : start + 100]
         right = b64encode(hashlib.new(algorithm, data).digest()).decode()
         wrong = b64encode(hashlib.new(algorithm, b"other").digest()).decode()
-        bad = piece(client, url, me, start, data, **{"Upload-Checksum": f"{algorithm} {wrong}"})
+        bad = piece(me, url, start, data, **{"Upload-Checksum": f"{algorithm} {wrong}"})
         assert bad.status_code == 460
         assert int(me.head(url).headers["upload-offset"]) == start
-        good = piece(client, url, me, start, data, **{"Upload-Checksum": f"{algorithm} {right}"})
+        good = piece(me, url, start, data, **{"Upload-Checksum": f"{algorithm} {right}"})
         assert good.status_code == 204
     for unknown in ("md5 AAAA", "sha1 AAAA", "sha256"):
-        assert piece(client, url, me, 200, b"x", **{"Upload-Checksum": unknown}).status_code == 400
+        assert piece(me, url, 200, b"x", **{"Upload-Checksum": unknown}).status_code == 400
 
 
 def tar_with_a_broken_later_header() -> bytes:
@@ -239,10 +212,10 @@ def tar_with_a_broken_later_header() -> bytes:
     ],
 )
 def test_an_unusable_file_is_refused_and_deleted(
-    client: TestClient, me: Caller, storage: Storage, data: bytes, metadata: dict[str, str], message: str
+    me: Caller, storage: Storage, data: bytes, metadata: dict[str, str], message: str
 ):
-    reply = begun(client, me, len(data), **metadata)
-    refused = piece(client, reply.headers["location"], me, 0, data)
+    reply = begun(me, len(data), **metadata)
+    refused = piece(me, reply.headers["location"], 0, data)
     assert refused.status_code == 422
     assert message in refused.json()["detail"]
     assert me.head(reply.headers["location"]).status_code == 404
@@ -250,7 +223,7 @@ def test_an_unusable_file_is_refused_and_deleted(
     assert stored_files(storage) == []
 
 
-def test_an_unusable_upload_is_refused_before_it_begins(client: TestClient, me: Caller):
+def test_an_unusable_upload_is_refused_before_it_begins(me: Caller):
     for size, metadata, status in [
         (0, {"filename": "a.tif"}, 422),
         (10, {}, 422),
@@ -265,24 +238,14 @@ def test_an_unusable_upload_is_refused_before_it_begins(client: TestClient, me: 
         (10, {"filename": "a.zip", "purpose": "block"}, 403),
         (10, {"filename": "..."}, 422),
     ]:
-        reply = begun(client, me, size, **metadata)
+        reply = begun(me, size, **metadata)
         assert reply.status_code == status, reply.text
         assert me.get("/scenes").json()["scenes"] == [], size
 
 
-def zipped(files: dict[str, bytes]) -> bytes:
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in files.items():
-            archive.writestr(name, data)
-    return out.getvalue()
-
-
-def test_an_archive_with_an_image_and_its_model_becomes_a_scene(
-    client: TestClient, me: Caller, storage: Storage
-):
+def test_an_archive_with_an_image_and_its_model_becomes_a_scene(me: Caller, storage: Storage):
     files = {"p/IMG_1.TIF": TIFF, "p/RPC_1.XML": b"<a/>", "p/READ.ME": b"x", "q/RPC_2.XML": b"<b/>"}
-    reply = whole(client, me, zipped(files), filename="delivery.zip")
+    reply = whole(me, zipped(files), filename="delivery.zip")
     assert reply.status_code == 204, reply.text
     scene = me.get(f"/scenes/{reply.headers['amers-scene']}").json()
     assert (scene["file"], scene["models"]) == ("IMG_1.TIF", ["RPC_1.XML"])
@@ -301,14 +264,13 @@ def tiles_of_a_product() -> dict[str, bytes]:
 
 
 def test_the_tiles_of_a_product_become_one_scene_that_is_read_whole(
-    client: TestClient,
     me: Caller,
     connection: Connection,
     storage: Storage,
     settings: Settings,
     tmp_path: Path,
 ) -> None:
-    reply = whole(client, me, zipped(tiles_of_a_product()), filename="delivery.zip")
+    reply = whole(me, zipped(tiles_of_a_product()), filename="delivery.zip")
     assert reply.status_code == 204, reply.text
     (row,) = newest_scenes(connection, None, 2)
     assert row.file_name == "a_R1C1.TIF"
@@ -316,9 +278,9 @@ def test_the_tiles_of_a_product_become_one_scene_that_is_read_whole(
     assert local_image(storage, settings, row, tmp_path).name == "a.TIL"
 
 
-def test_tiles_without_the_document_that_lists_them_are_refused(client: TestClient, me: Caller) -> None:
+def test_tiles_without_the_document_that_lists_them_are_refused(me: Caller) -> None:
     files = {name: content for name, content in tiles_of_a_product().items() if "TIL" not in name}
-    reply = whole(client, me, zipped(files), filename="delivery.zip")
+    reply = whole(me, zipped(files), filename="delivery.zip")
     assert "all tiles of one product with the document that lists them" in reply.text
 
 
@@ -330,7 +292,7 @@ def test_an_archive_needs_the_room_of_what_it_unpacks_to_and_no_more(
     files = {"a.tif": b"II*\0" + bytes(200_000), "a_RPC.TXT": bytes(3000), "READ.ME": bytes(100_000)}
     needed = len(files["a.tif"]) + len(files["a_RPC.TXT"])
     me = make_token(client, bearer("admin"), storage_quota_bytes=needed + room) | TUS
-    assert whole(client, me, zipped(files), filename="delivery.zip").status_code == status
+    assert whole(me, zipped(files), filename="delivery.zip").status_code == status
     stored = needed if status == 204 else 0
     assert bytes_in_ledger(connection) == bytes_in_storage(storage) == stored
 
@@ -347,19 +309,19 @@ def test_an_archive_needs_the_room_of_what_it_unpacks_to_and_no_more(
     ],
 )
 def test_an_archive_that_could_do_harm_or_is_no_scene_is_refused(
-    client: TestClient, me: Caller, storage: Storage, files: dict[str, bytes], message: str
+    me: Caller, storage: Storage, files: dict[str, bytes], message: str
 ):
-    reply = whole(client, me, zipped(files), filename="delivery.zip")
+    reply = whole(me, zipped(files), filename="delivery.zip")
     assert reply.status_code == 422
     assert message in reply.json()["detail"]
     assert stored_files(storage) == []
 
 
 def test_an_upload_of_another_owner_is_not_found(client: TestClient, me: Caller, bearer: Bearer):
-    url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
+    url = begun(me, len(TIFF), filename="a.tif").headers["location"]
     stranger = bearer("register") | TUS
     assert stranger.head(url).status_code == 404
-    assert piece(client, url, stranger, 0, TIFF).status_code == 404
+    assert piece(stranger, url, 0, TIFF).status_code == 404
     assert stranger.delete(url).status_code == 404
     assert client.head(url, headers=TUS).status_code == 401
 
@@ -367,9 +329,9 @@ def test_an_upload_of_another_owner_is_not_found(client: TestClient, me: Caller,
 def test_an_upload_that_is_ended_or_expires_leaves_nothing(
     client: TestClient, me: Caller, storage: Storage
 ):
-    first, second = (begun(client, me, len(TIFF), filename="a.tif") for _ in range(2))
-    piece(client, first.headers["location"], me, 0, TIFF[:100])
-    piece(client, second.headers["location"], me, 0, TIFF[:100])
+    first, second = (begun(me, len(TIFF), filename="a.tif") for _ in range(2))
+    piece(me, first.headers["location"], 0, TIFF[:100])
+    piece(me, second.headers["location"], 0, TIFF[:100])
     assert me.delete(first.headers["location"]).status_code == 204
     assert me.head(first.headers["location"]).status_code == 404
     database = client.app.state.database  # type: ignore[attr-defined]
@@ -418,13 +380,11 @@ def test_two_senders_of_one_file_do_not_mix(settings: Settings, me: dict[str, st
         assert http.get(url).json()["state"] == "finished"
 
 
-def test_a_block_that_has_arrived_is_there_to_be_ingested(
-    client: TestClient, bearer: Bearer, storage: Storage, dsn: str
-):
+def test_a_block_that_has_arrived_is_there_to_be_ingested(bearer: Bearer, storage: Storage, dsn: str):
     admin = bearer("admin") | TUS
-    reply = begun(client, admin, 100, filename="block.zip", purpose="block")
+    reply = begun(admin, 100, filename="block.zip", purpose="block")
     url = reply.headers["location"]
-    assert piece(client, url, admin, 0, bytes(100)).status_code == 204
+    assert piece(admin, url, 0, bytes(100)).status_code == 204
     with engine.connect(dsn) as connection:
         caller = list_tokens(connection)[0]
         key = find_uploaded_block(connection, caller, UUID(url.rsplit("/", 1)[-1]))
@@ -435,14 +395,14 @@ def test_a_block_that_has_arrived_is_there_to_be_ingested(
 def test_a_request_without_the_version_of_the_protocol_is_refused_and_changes_nothing(
     client: TestClient, me: Caller, version: str | None
 ):
-    url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
-    piece(client, url, me, 0, TIFF[:10])
+    url = begun(me, len(TIFF), filename="a.tif").headers["location"]
+    piece(me, url, 0, TIFF[:10])
     other = {name: value for name, value in me.items() if name not in TUS}
     other |= {} if version is None else {"Tus-Resumable": version}
     for refused in (
-        begun(client, other, 10, filename="b.tif"),
+        client.post("/uploads", headers=other | {"Upload-Length": "10"} | said(filename="b.tif")),
         client.head(url, headers=other),
-        piece(client, url, other, 10, TIFF[10:20]),
+        client.patch(url, content=TIFF[10:20], headers=other | PIECE | {"Upload-Offset": "10"}),
         client.delete(url, headers=other),
         client.post(url, headers=other | {"X-HTTP-Method-Override": "DELETE"}),
     ):
@@ -461,85 +421,79 @@ def shown(me: Caller, reply: httpx.Response) -> dict[str, object]:
 
 
 @pytest.fixture
-def arriving(client: TestClient, me: Caller) -> str:
+def arriving(me: Caller) -> str:
     """The id of a scene whose image arrives."""
-    return str(begun(client, me, 10, filename="a.tif").headers["amers-scene"])
+    return str(begun(me, 10, filename="a.tif").headers["amers-scene"])
 
 
 @pytest.mark.parametrize("named", [{}, {"purpose": "model"}])
-def test_a_file_that_names_a_scene_is_a_model_of_it(
-    client: TestClient, me: Caller, arriving: str, named: dict[str, str]
-):
-    model = shown(me, begun(client, me, 10, filename="a.xml", scene=arriving, **named))
+def test_a_file_that_names_a_scene_is_a_model_of_it(me: Caller, arriving: str, named: dict[str, str]):
+    model = shown(me, begun(me, 10, filename="a.xml", scene=arriving, **named))
     assert (model["purpose"], model["scene"]) == ("model", arriving)
 
 
 @pytest.mark.parametrize("named", [{}, {"purpose": "image"}])
 def test_a_file_that_names_no_scene_is_the_image_of_another_one(
-    client: TestClient, me: Caller, arriving: str, named: dict[str, str]
+    me: Caller, arriving: str, named: dict[str, str]
 ):
-    image = shown(me, begun(client, me, 10, filename="a.tif", **named))
+    image = shown(me, begun(me, 10, filename="a.tif", **named))
     assert (image["purpose"], image["scene"] == arriving) == ("image", False)
 
 
-def test_an_image_does_not_join_a_scene(client: TestClient, me: Caller, arriving: str):
-    beside = begun(client, me, 10, filename="b.tif", purpose="image", scene=arriving)
+def test_an_image_does_not_join_a_scene(me: Caller, arriving: str):
+    beside = begun(me, 10, filename="b.tif", purpose="image", scene=arriving)
     assert (beside.status_code, "creates a new scene" in beside.json()["detail"]) == (422, True)
 
 
 @pytest.mark.parametrize("named", [{}, {"scene": str(UUID(int=1))}])
-def test_a_block_belongs_to_no_scene(client: TestClient, bearer: Bearer, named: dict[str, str]):
+def test_a_block_belongs_to_no_scene(bearer: Bearer, named: dict[str, str]):
     me = bearer("admin") | TUS
-    block = shown(me, begun(client, me, 10, filename="a.zip", purpose="block", **named))
+    block = shown(me, begun(me, 10, filename="a.zip", purpose="block", **named))
     assert (block["purpose"], block.get("scene")) == ("block", None)
 
 
 @pytest.mark.parametrize("letters", [1, 195, 196, 197, 500])
-def test_of_a_long_name_the_last_two_hundred_letters_are_kept(
-    client: TestClient, me: Caller, letters: int
-):
+def test_of_a_long_name_the_last_two_hundred_letters_are_kept(me: Caller, letters: int):
     name = f"{'ab' * letters}"[:letters] + ".tif"
-    reply = begun(client, me, 10, filename=name)
+    reply = begun(me, 10, filename=name)
     assert shown(me, reply)["name"] == name[-200:]
     scene = me.get(f"/scenes/{reply.headers['amers-scene']}").json()
     assert scene["name"] == name[-200:]
 
 
-def test_each_piece_gives_an_upload_another_day(client: TestClient, me: Caller, connection: Connection):
+def test_each_piece_gives_an_upload_another_day(me: Caller, connection: Connection):
     def hours_left(reply: httpx.Response) -> float:
         expiry = parsedate_to_datetime(reply.headers["upload-expires"])
         return (expiry - datetime.now(UTC)).total_seconds() / 3600.0
 
-    reply = begun(client, me, len(TIFF), filename="a.tif")
+    reply = begun(me, len(TIFF), filename="a.tif")
     url = reply.headers["location"]
     assert hours_left(reply) == pytest.approx(24.0, abs=0.1)
-    other = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
+    other = begun(me, len(TIFF), filename="a.tif").headers["location"]
     for data in (TIFF[:10], b""):
         run_sql(connection, "update upload set expires_at = now() + interval '1 hour'")
         connection.commit()
         start = int(me.head(url).headers["upload-offset"])
-        assert piece(client, url, me, start, data).status_code == 204
+        assert piece(me, url, start, data).status_code == 204
         assert hours_left(me.head(url)) == pytest.approx(24.0, abs=0.1)
         assert hours_left(me.head(other)) == pytest.approx(1.0, abs=0.1)
 
 
-def test_the_largest_model_may_be_announced_and_the_largest_raster_as_an_image(
-    client: TestClient, me: Caller
-):
-    scene = begun(client, me, LIMIT_BYTES, filename="a.tif").headers["amers-scene"]
+def test_the_largest_model_may_be_announced_and_the_largest_raster_as_an_image(me: Caller):
+    scene = begun(me, LIMIT_BYTES, filename="a.tif").headers["amers-scene"]
     for name, most in (("a.xml", SIDE_FILE_LIMIT_BYTES), ("mask.tif", LIMIT_BYTES)):
         for size, status in ((most, 201), (most + 1, 413)):
-            assert begun(client, me, size, filename=name, scene=scene).status_code == status, name
+            assert begun(me, size, filename=name, scene=scene).status_code == status, name
 
 
 def test_a_model_that_does_not_arrive_leaves_the_scene_and_its_former_model(
-    client: TestClient, me: Caller, storage: Storage
+    me: Caller, storage: Storage
 ):
-    scene = whole(client, me, TIFF, filename="a.tif").headers["amers-scene"]
-    whole(client, me, b"former", filename="a_RPC.TXT", scene=scene)
-    ended = begun(client, me, 4, filename="a_RPC.TXT", scene=scene).headers["location"]
+    scene = whole(me, TIFF, filename="a.tif").headers["amers-scene"]
+    whole(me, b"former", filename="a_RPC.TXT", scene=scene)
+    ended = begun(me, 4, filename="a_RPC.TXT", scene=scene).headers["location"]
     assert me.delete(ended).status_code == 204
-    wrong = whole(client, me, b"<a/>", filename="a_RPC.TXT", scene=scene, sha256="0" * 64)
+    wrong = whole(me, b"<a/>", filename="a_RPC.TXT", scene=scene, sha256="0" * 64)
     assert wrong.status_code == 422
     document = me.get(f"/scenes/{scene}").json()
     assert (document["state"], document["models"]) == ("uploaded", ["a_RPC.TXT"])
@@ -548,100 +502,96 @@ def test_a_model_that_does_not_arrive_leaves_the_scene_and_its_former_model(
 
 
 def test_the_model_that_an_administrator_sends_belongs_to_the_owner_of_the_scene(
-    client: TestClient, me: Caller, bearer: Bearer
+    me: Caller, bearer: Bearer
 ):
-    scene = whole(client, me, TIFF, filename="a.tif").headers["amers-scene"]
+    scene = whole(me, TIFF, filename="a.tif").headers["amers-scene"]
     admin, stranger = bearer("admin") | TUS, bearer("register") | TUS
-    assert begun(client, stranger, 4, filename="a.xml", scene=scene).status_code == 404
-    url = begun(client, admin, 4, filename="a.xml", scene=scene).headers["location"]
+    assert begun(stranger, 4, filename="a.xml", scene=scene).status_code == 404
+    url = begun(admin, 4, filename="a.xml", scene=scene).headers["location"]
     assert stranger.head(url).status_code == 404
-    assert piece(client, url, me, 0, b"<a/>").status_code == 204
+    assert piece(me, url, 0, b"<a/>").status_code == 204
     assert me.get(f"/scenes/{scene}").json()["models"] == ["a.xml"]
 
 
-def test_an_upload_whose_bytes_are_on_another_machine_has_to_begin_again(
-    client: TestClient, me: Caller, storage: Storage
-):
-    url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
+def test_an_upload_whose_bytes_are_on_another_machine_has_to_begin_again(me: Caller, storage: Storage):
+    url = begun(me, len(TIFF), filename="a.tif").headers["location"]
     (arriving,) = storage.scratch().iterdir()
     arriving.unlink()
-    for reply in (me.get(url), piece(client, url, me, 0, TIFF)):
+    for reply in (me.get(url), piece(me, url, 0, TIFF)):
         assert reply.status_code == 404
         assert "start a new upload" in reply.json()["detail"]
 
 
 @pytest.mark.parametrize("announced", [True, False])
 def test_the_checksum_of_a_block_is_kept_whether_it_was_announced_or_not(
-    client: TestClient, bearer: Bearer, connection: Connection, announced: bool
+    bearer: Bearer, connection: Connection, announced: bool
 ):
     data, admin = b"PK\3\4" * 10, bearer("admin") | TUS
     sha256 = hashlib.sha256(data).hexdigest()
     more = {"sha256": sha256} if announced else {}
-    assert whole(client, admin, data, filename="a.zip", purpose="block", **more).status_code == 204
+    assert whole(admin, data, filename="a.zip", purpose="block", **more).status_code == 204
     row = run_sql(connection, "select sha256, size_bytes from upload").fetchone()
     assert row == {"sha256": sha256, "size_bytes": len(data)}
 
 
-def test_a_complete_upload_is_not_ended_with_its_scene(client: TestClient, me: Caller, storage: Storage):
-    url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
-    scene = piece(client, url, me, 0, TIFF).headers["amers-scene"]
+def test_a_complete_upload_is_not_ended_with_its_scene(me: Caller, storage: Storage):
+    url = begun(me, len(TIFF), filename="a.tif").headers["location"]
+    scene = piece(me, url, 0, TIFF).headers["amers-scene"]
     assert me.delete(url).status_code == 409
     assert me.get(f"/scenes/{scene}").status_code == 200
     assert storage.keys("scenes") == [f"scenes/{scene}/a.tif"]
 
 
-def test_a_complete_upload_takes_its_end_again_and_nothing_else(client: TestClient, me: Caller):
+def test_a_complete_upload_takes_its_end_again_and_nothing_else(me: Caller):
     """The confirmation of the last piece may have been lost."""
-    url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
-    piece(client, url, me, 0, TIFF)
-    assert piece(client, url, me, len(TIFF), b"").status_code == 204
-    assert piece(client, url, me, 0, TIFF).status_code == 404
-    assert piece(client, url, me, len(TIFF) + 1, b"").status_code == 404
+    url = begun(me, len(TIFF), filename="a.tif").headers["location"]
+    piece(me, url, 0, TIFF)
+    assert piece(me, url, len(TIFF), b"").status_code == 204
+    assert piece(me, url, 0, TIFF).status_code == 404
+    assert piece(me, url, len(TIFF) + 1, b"").status_code == 404
 
 
-def test_a_checksum_is_compared_in_small_letters_and_in_capitals(client: TestClient, me: Caller):
+def test_a_checksum_is_compared_in_small_letters_and_in_capitals(me: Caller):
     for digest in (hashlib.sha256(TIFF).hexdigest(), hashlib.sha256(TIFF).hexdigest().upper()):
-        assert whole(client, me, TIFF, filename="a.tif", sha256=digest).status_code == 204
+        assert whole(me, TIFF, filename="a.tif", sha256=digest).status_code == 204
 
 
-def test_the_accuracy_of_a_model_is_a_number_of_metres_above_zero(client: TestClient, me: Caller):
+def test_the_accuracy_of_a_model_is_a_number_of_metres_above_zero(me: Caller):
     for sigma_m, status in [("0", 422), ("-1", 422), ("inf", 422), ("0.1", 201)]:
-        assert begun(client, me, 10, filename="a.tif", sigma_m=sigma_m).status_code == status, sigma_m
+        assert begun(me, 10, filename="a.tif", sigma_m=sigma_m).status_code == status, sigma_m
 
 
-def test_a_block_is_ingested_from_a_complete_archive_of_ones_own(
-    client: TestClient, bearer: Bearer, connection: Connection
-):
+def test_a_block_is_ingested_from_a_complete_archive_of_ones_own(bearer: Bearer, connection: Connection):
     admin, me = bearer("admin") | TUS, bearer("register") | TUS
     callers = {token.scopes[0]: token for token in list_tokens(connection)}
 
     def id_of(url: str) -> UUID:
         return UUID(url.rsplit("/", 1)[-1])
 
-    arriving = begun(client, admin, 40, filename="block.zip", purpose="block").headers["location"]
+    arriving = begun(admin, 40, filename="block.zip", purpose="block").headers["location"]
     with pytest.raises(Conflict, match="not complete"):
         find_uploaded_block(connection, callers["admin"], id_of(arriving))
-    assert piece(client, arriving, admin, 0, bytes(40)).status_code == 204
+    assert piece(admin, arriving, 0, bytes(40)).status_code == 204
     key = find_uploaded_block(connection, callers["admin"], id_of(arriving))
     assert key == f"uploads/{id_of(arriving)}/block.zip"
     with pytest.raises(NotFound):
         find_uploaded_block(connection, callers["register"], id_of(arriving))
-    image = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
-    assert piece(client, image, me, 0, TIFF).status_code == 204
+    image = begun(me, len(TIFF), filename="a.tif").headers["location"]
+    assert piece(me, image, 0, TIFF).status_code == 204
     for caller in callers.values():
         with pytest.raises(InputError, match="purpose image"):
             find_uploaded_block(connection, caller, id_of(image))
 
 
 def test_the_archive_of_a_block_is_found_by_its_upload_and_no_other_file_is(
-    client: TestClient, bearer: Bearer, connection: Connection, storage: Storage
+    bearer: Bearer, connection: Connection, storage: Storage
 ):
     admin = bearer("admin") | TUS
     ids = {}
     for purpose, name in (("block", "a.zip"), ("image", "a.tif"), ("block", "b.zip")):
-        reply = begun(client, admin, len(TIFF), filename=name, purpose=purpose)
+        reply = begun(admin, len(TIFF), filename=name, purpose=purpose)
         url = reply.headers["location"]
-        assert piece(client, url, admin, 0, TIFF).status_code == 204
+        assert piece(admin, url, 0, TIFF).status_code == 204
         ids[name] = UUID(url.rsplit("/", 1)[-1])
     found = {name: upload_rows.find_block(connection, upload_id) for name, upload_id in ids.items()}
     keys = {name: f"uploads/{ids[name]}/{name}" for name in ("a.zip", "b.zip")}
@@ -653,9 +603,9 @@ def test_the_archive_of_a_block_is_found_by_its_upload_and_no_other_file_is(
 def test_what_a_complete_upload_has_left_beside_its_file_is_removed(
     client: TestClient, me: Caller, storage: Storage
 ):
-    arriving = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
-    complete = begun(client, me, len(TIFF), filename="b.tif").headers["location"]
-    assert piece(client, complete, me, 0, TIFF).status_code == 204
+    arriving = begun(me, len(TIFF), filename="a.tif").headers["location"]
+    complete = begun(me, len(TIFF), filename="b.tif").headers["location"]
+    assert piece(me, complete, 0, TIFF).status_code == 204
     name = f"{UPLOAD_PREFIX}{complete.rsplit('/', 1)[-1]}"
     (storage.scratch() / name).write_bytes(b"left by a service that was killed")
     assert remove_abandoned_uploads(client.app.state.database, storage) == [name]  # type: ignore[attr-defined]
@@ -663,13 +613,12 @@ def test_what_a_complete_upload_has_left_beside_its_file_is_removed(
 
 
 def test_archives_are_stored_and_swept_alike_however_they_were_uploaded(
-    client: TestClient, bearer: Bearer, storage: Storage, settings: Settings, dsn: str
+    admin: Caller, storage: Storage, settings: Settings, dsn: str
 ):
-    admin = bearer("admin")
     put = admin.put("/blocks/uploads/a.zip", content=b"PK\3\4" * 10).json()["upload"]
-    reply = begun(client, admin | TUS, 40, filename="a.zip", purpose="block")
+    reply = begun(admin, 40, filename="a.zip", purpose="block")
     tus = reply.headers["location"].rsplit("/", 1)[1]
-    assert piece(client, reply.headers["location"], admin | TUS, 0, bytes(40)).status_code == 204
+    assert piece(admin, reply.headers["location"], 0, bytes(40)).status_code == 204
     keys = sorted(f"uploads/{upload}/a.zip" for upload in (put, tus))
     assert storage.keys("uploads") == keys
     execute = "/processes/ingest-block/execution"

@@ -19,7 +19,7 @@ from tests.app.worker_processes import (
     kill,
     wait_until,
 )
-from tests.statements import run_sql
+from tests.statements import run_in
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
@@ -207,13 +207,12 @@ def test_a_worker_outlives_the_loss_of_all_its_connections(installation: Install
     job = ask(PASSES)
     with installation.worker(lease_seconds=15.0) as worker:
         installation.process(job, worker)
-        with engine.connect(installation.dsn) as connection:
-            run_sql(
-                connection,
-                "select pg_terminate_backend(pid) from pg_stat_activity"
-                " where datname = current_database() and usename = current_user"
-                " and pid <> pg_backend_pid()",
-            )
+        run_in(
+            engine.connect(installation.dsn),
+            "select pg_terminate_backend(pid) from pg_stat_activity"
+            " where datname = current_database() and usename = current_user"
+            " and pid <> pg_backend_pid()",
+        )
         ended_job = installation.ended(job)
         other = installation.ended(ask(1))
         assert worker.poll() is None

@@ -18,6 +18,7 @@ from amers.app.storage import Storage
 from amers.app.usecases.blocks import lifecycle
 from amers.app.usecases.tokens import create_token
 from tests.app.conftest import TEMPLATE, fresh_database
+from tests.app.served import serve_block
 from tests.factories import MadeBlock, make_block
 from tests.statements import run_sql
 
@@ -57,8 +58,7 @@ def filled_store(cluster: Cluster, folder: Path) -> Iterator[Store]:
         settings = Settings(database_url=SecretStr(dsn), data_folder=folder / "data")
         with engine.connect(dsn) as connection:
             storage = Storage(settings.data_folder / "storage")
-            lifecycle.ingest_block(connection, storage, made.folder)
-            lifecycle.publish_block(connection, "calanques")
+            serve_block(connection, storage, made.folder)
             run_sql(connection, "insert into point_history (point_id) select id from point limit 3")
             lifecycle.ingest_block(connection, storage, staged.folder)
             secret = create_token(connection, "a token to read", ["read"]).secret
