@@ -1,12 +1,9 @@
 """Failures between the moment a whole upload is stored and the commit that records it."""
 
-import io
 import os
 import signal
 import subprocess
 import sys
-import zipfile
-from base64 import b64encode
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,8 +16,9 @@ from amers.app.config import Settings
 from amers.app.db import engine
 from amers.app.main import create_app
 from amers.app.storage import Storage
-from tests.app.callers import Bearer
+from tests.app.callers import Bearer, Caller
 from tests.app.s3_server import running_bucket
+from tests.app.sending import PIECE, TUS, said, zipped
 from tests.app.worker_processes import wait_until
 from tests.command_line import environment_of
 from tests.service_process import free_port
@@ -31,8 +29,6 @@ pytestmark = pytest.mark.thorough
 
 TIFF = b"II*\0" + bytes(range(256)) * 40
 MODEL = b"LINE_OFF: 1"
-TUS = {"Tus-Resumable": "1.0.0"}
-PIECE = {"Content-Type": "application/offset+octet-stream"}
 PURPOSES = ("image", "archive", "model", "block")
 CUT = "perform pg_terminate_backend(pg_backend_pid())"
 """The connection breaks while the database commits: everything is rolled back."""
@@ -87,16 +83,13 @@ def at_commit(dsn: str, table: str, statement: str) -> Iterator[None]:
             run_sql(connection, "drop function fault cascade")
 
 
-def archive() -> bytes:
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w") as members:
-        members.writestr("IMG.TIF", TIFF)
-        members.writestr("IMG_RPC.TXT", MODEL)
-    return out.getvalue()
-
-
 def content_of(purpose: str) -> bytes:
-    return {"image": TIFF, "archive": archive(), "model": MODEL, "block": b"PK\3\4" * 20}[purpose]
+    return {
+        "image": TIFF,
+        "archive": zipped({"IMG.TIF": TIFF, "IMG_RPC.TXT": MODEL}),
+        "model": MODEL,
+        "block": b"PK\3\4" * 20,
+    }[purpose]
 
 
 def announce(http: httpx.Client, me: dict[str, str], purpose: str) -> str:
@@ -108,11 +101,8 @@ def announce(http: httpx.Client, me: dict[str, str], purpose: str) -> str:
         scene = http.post("/scenes?name=IMG.TIF", content=TIFF, headers=me).json()["id"]
         http.put(f"/scenes/{scene}/files/IMG_RPC.TXT", content=b"former", headers=me).raise_for_status()
         values["scene"] = scene
-    metadata = ",".join(f"{key} {b64encode(value.encode()).decode()}" for key, value in values.items())
-    length = str(len(content_of(purpose)))
-    reply = http.post(
-        "/uploads", headers=me | TUS | {"Upload-Length": length, "Upload-Metadata": metadata}
-    )
+    length = {"Upload-Length": str(len(content_of(purpose)))}
+    reply = http.post("/uploads", headers=me | TUS | length | said(**values))
     assert reply.status_code == 201, reply.text
     return reply.headers["location"]
 
@@ -205,23 +195,21 @@ def killed_service(settings: Settings, log: Path) -> Iterator[str]:
 
 
 def test_a_scene_whose_commit_fails_leaves_nothing_and_can_be_sent_again(
-    client: TestClient, bearer: Bearer, storage: Storage, dsn: str
+    me: Caller, storage: Storage, dsn: str
 ):
-    me = bearer("register")
     with at_commit(dsn, "scene", CUT):
-        reply = client.post("/scenes?name=a.tif", content=TIFF, headers=me)
+        reply = me.post("/scenes?name=a.tif", content=TIFF)
         assert reply.status_code == 503, reply.text
-    assert client.get("/scenes", headers=me).json()["scenes"] == []
+    assert me.get("/scenes").json()["scenes"] == []
     assert storage.keys("scenes") == []
-    assert client.post("/scenes?name=a.tif", content=TIFF, headers=me).status_code == 201
+    assert me.post("/scenes?name=a.tif", content=TIFF).status_code == 201
 
 
 def test_a_scene_keeps_its_image_when_the_confirmation_of_its_commit_is_lost(
-    client: TestClient, bearer: Bearer, storage: Storage, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, me: Caller, storage: Storage, monkeypatch: pytest.MonkeyPatch
 ):
     from amers.app.db import scenes
 
-    me = bearer("register")
     database = client.app.state.database  # type: ignore[attr-defined]
     finish = scenes.finish_upload
 
@@ -231,35 +219,34 @@ def test_a_scene_keeps_its_image_when_the_confirmation_of_its_commit_is_lost(
         run_sql(connection, "select pg_terminate_backend(pg_backend_pid())")
 
     monkeypatch.setattr(scenes, "finish_upload", committed_and_lost)
-    assert client.post("/scenes?name=a.tif", content=TIFF, headers=me).status_code == 503
-    (scene,) = client.get("/scenes", headers=me).json()["scenes"]
+    assert me.post("/scenes?name=a.tif", content=TIFF).status_code == 503
+    (scene,) = me.get("/scenes").json()["scenes"]
     assert scene["state"] == "uploaded"
-    assert client.get(f"/scenes/{scene['id']}/files/a.tif", headers=me).content == TIFF
+    assert me.get(f"/scenes/{scene['id']}/files/a.tif").content == TIFF
 
 
 @pytest.mark.parametrize("former", [None, b"LINE_OFF: 2"])
 def test_a_side_file_whose_commit_fails_leaves_no_row_that_lies(
-    client: TestClient, bearer: Bearer, storage: Storage, dsn: str, former: bytes | None
+    me: Caller, storage: Storage, dsn: str, former: bytes | None
 ):
-    me = bearer("register")
-    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()["id"]
+    scene = me.post("/scenes?name=a.tif", content=TIFF).json()["id"]
     url = f"/scenes/{scene}/files/a_RPC.TXT"
     if former is not None:
-        client.put(url, content=former, headers=me).raise_for_status()
+        me.put(url, content=former).raise_for_status()
     with at_commit(dsn, "scene", CUT):
-        assert client.put(url, content=MODEL, headers=me).status_code == 503
-    assert client.get(f"/scenes/{scene}", headers=me).json()["models"] == []
+        assert me.put(url, content=MODEL).status_code == 503
+    assert me.get(f"/scenes/{scene}").json()["models"] == []
     assert storage.keys(f"scenes/{scene}") == [f"scenes/{scene}/a.tif"]
-    assert client.put(url, content=MODEL, headers=me).status_code == 200
-    assert client.get(url, headers=me).content == MODEL
+    assert me.put(url, content=MODEL).status_code == 200
+    assert me.get(url).content == MODEL
 
 
 def test_a_block_whose_commit_fails_leaves_nothing_and_can_be_sent_again(
-    client: TestClient, bearer: Bearer, storage: Storage, dsn: str
+    bearer: Bearer, storage: Storage, dsn: str
 ):
     me = bearer("admin")
     with at_commit(dsn, "upload", CUT):
-        reply = client.put("/blocks/uploads/a.zip", content=content_of("block"), headers=me)
+        reply = me.put("/blocks/uploads/a.zip", content=content_of("block"))
         assert reply.status_code == 503, reply.text
     assert storage.keys("uploads") == []
-    assert client.put("/blocks/uploads/a.zip", content=content_of("block"), headers=me).is_success
+    assert me.put("/blocks/uploads/a.zip", content=content_of("block")).is_success
