@@ -73,8 +73,7 @@ def let_lease_lapse(database: Database, job_id: UUID) -> None:
 
 def tickets(connection: Connection) -> int:
     """The number of tickets that workers may take, now or later."""
-    row = run_sql(
+    (row,) = run_sql(
         connection, "select count(*) as n from procrastinate_jobs where status = 'todo'"
-    ).fetchone()
-    assert row is not None
+    ).fetchall()
     return int(row["n"])

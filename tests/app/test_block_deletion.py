@@ -68,8 +68,7 @@ def rows_left(database: Database) -> dict[str, int]:
 
 
 def count(connection: Connection, table: str) -> int:
-    row = run_sql(connection, f"select count(*) as n from {table}").fetchone()
-    assert row is not None
+    (row,) = run_sql(connection, f"select count(*) as n from {table}").fetchall()
     return int(row["n"])
 
 
@@ -154,12 +153,11 @@ def test_a_registration_that_ends_after_the_deletion_leaves_its_measures_and_no_
 
 def registered_at(connection: Connection, point_id: int) -> UUID:
     """A registration with one active point."""
-    row = run_sql(
+    (row,) = run_sql(
         connection,
         """insert into registration (id, block_versions, options, report, verdict, files)
             values (gen_random_uuid(), '[]', '{}', '{}', 'good', '{}') returning id""",
-    ).fetchone()
-    assert row is not None
+    ).fetchall()
     registration: UUID = row["id"]
     measure = "insert into measure (registration_id, point_id, matched, active, reason)"
     run_sql(connection, f"{measure} values (%s, %s, true, true, '')", [registration, point_id])

@@ -176,11 +176,10 @@ def test_a_ticket_spent_at_the_limit_comes_back_when_a_job_of_the_owner_ends(
         let_lease_lapse(database, running)
         sweep_jobs(database, LEASE_S, 1)
     with database.transaction() as connection:
-        due = run_sql(
+        (due,) = run_sql(
             connection,
             "select count(*) as n from procrastinate_jobs where coalesce(scheduled_at, now()) <= now()",
-        ).fetchone()
-        assert due is not None
+        ).fetchall()
         assert due["n"] == 1
         assert claim(connection, 1).id == (running if how in ("give_back", "die") else waiting)
 

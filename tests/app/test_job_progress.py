@@ -12,7 +12,7 @@ from amers.app.db.jobs.jobs import Job, JobFilter
 from amers.app.db.jobs.progress import Outlook
 from amers.app.storage import Storage
 from amers.app.worker.sweep import sweep_records
-from tests.app.job_queue import claim
+from tests.app.job_queue import claim, requested
 from tests.statements import run_in, run_sql
 
 LEASE_S = 30.0
@@ -22,9 +22,7 @@ a_slow_machine = timedelta(seconds=15)
 
 def asked(connection: Connection, kind: str = "register-scene") -> Job:
     """A new job."""
-    job = jobs.create(connection, kind, {"scene": str(uuid4())})
-    assert job is not None
-    return job
+    return requested(connection, kind, {"scene": str(uuid4())})
 
 
 def begun(connection: Connection, kind: str = "register-scene") -> Job:

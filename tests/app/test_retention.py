@@ -15,7 +15,7 @@ from amers.app.storage import Storage
 from amers.app.usecases.results import result_key
 from amers.app.usecases.tokens import create_token
 from amers.app.worker.sweep import sweep_files, sweep_records
-from tests.app.job_queue import claim, requested, store_registration
+from tests.app.job_queue import claim, requested, state_of, store_registration
 from tests.statements import run_in, run_sql
 
 OLDER = (
@@ -67,8 +67,7 @@ def test_results_then_jobs_are_removed_by_default_and_the_registration_stays(
     database: Database, storage: Storage, settings: Settings
 ):
     job_id = successful_job(database, storage)
-    job = find(database, job_id)
-    assert job is not None
+    job = state_of(database, job_id)
     assert [result_key(job, "report.json")] == storage.keys("results")
     clock_jumps(database, 5000)
     sweep_records(database, storage, settings)
@@ -76,8 +75,7 @@ def test_results_then_jobs_are_removed_by_default_and_the_registration_stays(
     service_runs(database, 91)
     sweep_records(database, storage, settings)
     assert storage.keys("results") == []
-    kept = find(database, job_id)
-    assert kept is not None
+    kept = state_of(database, job_id)
     assert kept.results_removed_at is not None
     assert kept.results is not None
     with pytest.raises(NotFound, match=r"no result report\.json"):
@@ -108,8 +106,7 @@ def test_the_files_of_a_job_that_failed_stay_for_their_days_and_are_removed_afte
     service_runs(database, 2)
     sweep_records(database, storage, settings)
     assert storage.keys("results") == []
-    failed = find(database, job_id)
-    assert failed is not None
+    failed = state_of(database, job_id)
     assert failed.results_removed_at is not None
 
 
