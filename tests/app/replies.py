@@ -60,6 +60,7 @@ UNORDERED = ("features", "scenes", "jobs")
 """Lists that may be in the order of ids, which are drawn."""
 ACROSS = "bbox=179,-18,-179,-16"
 TRIANGLE = [[5.2, 43.2], [5.3, 43.2], [5.25, 43.28], [5.2, 43.2]]
+LAT_LON = "http://www.opengis.net/def/crs/EPSG/0/4326"
 MERCATOR = "http://www.opengis.net/def/crs/EPSG/0/3857"
 SEARCHES: tuple[dict[str, Any], ...] = (
     {"limit": 4},
@@ -140,6 +141,7 @@ OTHERS = (
     *(f"/collections/{name}?f=html" for name in ("blocks", "scenes")),
     f"/collections/points/items?limit=3&bbox={WEST},{SOUTH},100,{EAST},{NORTH},120",
     f"/collections/points/items?limit=3&bbox-crs={MERCATOR}&bbox=581000,5344000,584000,5349000",
+    f"/collections/points/items?limit=3&bbox-crs={LAT_LON}&bbox={SOUTH},{WEST},{NORTH},{EAST}",
     "/collections/points/items?limit=3&n_views=2&sortby=sigma_east_m&properties=sigma_east_m",
     "/collections/points/items?limit=2500&properties=n_views",
     *(f"/search?limit=1&sortby={one}" for one in ("gsd", "-gsd")),
