@@ -257,9 +257,9 @@ def test_pages_of_the_audit_trail_follow_each_other_without_repetition(connectio
         create_token(connection, f"token {number}", ["read"])
     everything = [change.id for change in changes(connection)]
     pages, before = [], None
-    while page := [change.id for change in list_changes(connection, 2, before, None, None)]:
-        pages += page
-        before = page[-1]
+    while len(pages) < 9 and (page := list_changes(connection, 2, before, None, None)):
+        pages += [change.id for change in page]
+        before = pages[-1]
     assert pages == everything[::-1] == sorted(everything, reverse=True)
     assert len(pages) == 5
 
