@@ -113,7 +113,9 @@ def points_expected(
     count: int,
     cut_px: Array | float = 0.0,
 ) -> IntArray:
-    """Rows of well-spread points of which a scene that may be far off is expected to show some whole.
+    """Rows of the best points of which a scene that may be far off is expected to show some whole.
+
+    The best are salient, healthy and likely to be shown, all three together.
 
     Args:
         scene: gives the size of the image.
@@ -126,12 +128,7 @@ def points_expected(
     probability = visibility_probability(scene, points, prediction, gsd_m, cut_px=cut_px)
     probability[~has_chip(points, gsd_m)] = 0.0
     rows = np.flatnonzero(probability > 0.0)
-    line_sample = prediction.model.project(points.lon_lat_h[rows])
     preference = (points.saliency * points.health * probability)[rows]
-    order = rows[
-        spread_over_image(
-            line_sample, points.lon_lat_h[rows, 2], preference, scene.image.shape, len(rows)
-        )
-    ]
+    order = rows[np.argsort(-preference, kind="stable")]
     needed = int(np.searchsorted(np.cumsum(probability[order]), count)) + 1
     return np.sort(order[:needed])
