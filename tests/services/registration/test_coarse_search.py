@@ -5,8 +5,10 @@ import pytest
 
 from amers.services.errors import NoConsensus
 from amers.services.imagery.scene import Scene
-from amers.services.registration.coarse import search_coarsely
+from amers.services.imagery.source import ReducedImage
+from amers.services.registration.coarse import _image_for, search_coarsely
 from amers.services.registration.context import Prediction, SearchStage
+from amers.services.registration.on_reference import _image_at
 from amers.services.types import Array
 from tests.services.registration.small_ground import (
     SIDE_PX,
@@ -61,3 +63,23 @@ def test_points_whose_chips_show_the_same_ground_are_too_few_to_be_believed() ->
         (group,) = stage.candidates
         assert group.points == 9
         np.testing.assert_allclose([group.east_m, group.north_m], OFF_M, atol=GSD_M)
+
+
+@pytest.mark.parametrize("shape", [(1000, 900), (900, 1000)])
+def test_an_image_is_reduced_where_windows_hold_more_pixels_than_it_has(shape: tuple[int, int]) -> None:
+    """Of points with chips of 8 m and of 16 m, of which two pixels are left; and of places."""
+    of = scene(np.zeros(2), SIGMA_M, *shape)
+    pixels = shape[0] * shape[1]
+    for gsd_m, radius_px in ((8.1, 10), (16.2, 0)):
+        window = (100 + 2 * radius_px) * gsd_m / 2.0  # pixels of 2 m
+        enough = int(pixels / window**2) + 1
+        fewer, more = (_image_for(of, gsd_m, count, radius_px) for count in (enough - 1, enough))
+        assert fewer is of.image
+        assert isinstance(more, ReducedImage)
+        assert more.factor == int(gsd_m) / 4
+    assert _image_for(of, 7.9, 1_000_000, 10) is of.image, "less than two pixels would be left"
+    fewer, more = (_image_at(of, 3, count, 100) for count in (10, 11))
+    assert fewer is of.image
+    assert isinstance(more, ReducedImage)
+    assert more.factor == 3
+    assert _image_at(of, 1, 1_000_000, 100) is of.image

@@ -1,26 +1,35 @@
 """An image that was mirrored or turned fits its model again when the model is turned as it is said."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from amers.services.errors import NotEnoughPoints
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage
+from amers.services.matching.control_points import MatchingOptions
+from amers.services.registration.on_points import _how_it_is_turned
+from amers.services.registration.options import CoarseOptions, RegistrationOptions
 from amers.services.registration.turned import turned_scenes
 from amers.services.types import Acquisition, FloatImage
+from tests.factories import control_points
 from tests.services.conftest import FlatModel
+from tests.services.simulated import MemoryChips
 
 LINES, SAMPLES = 7, 10
 DELIVERED = np.arange(LINES * SAMPLES, dtype=np.float32).reshape(LINES, SAMPLES)
 """The image that belongs to the model: no two pixels are alike."""
 AT = np.stack(np.meshgrid(np.arange(LINES), np.arange(SAMPLES), indexing="ij"), -1).reshape(-1, 2)
+BLANK = Scene(ArrayImage(DELIVERED), FlatModel(), Acquisition("blank"), 1.0)
 GROUND = FlatModel().locate(AT.astype(np.float64), np.zeros(len(AT)))
 
 
 def pixels_by(words: str, image: FloatImage) -> FloatImage:
     """The pixels (n,) at which a model that is turned in this way expects the ground; NaN beyond."""
-    scene = Scene(ArrayImage(image), FlatModel(), Acquisition("turned"), 1.0)
+    scene = replace(BLANK, image=ArrayImage(image))
     (turned,) = (one for said, one in turned_scenes(scene) if said == words)
     at = turned.model.project(GROUND)
     np.testing.assert_allclose(at, np.rint(at), atol=1e-6)
@@ -43,10 +52,66 @@ WAYS: dict[str, Callable[[FloatImage], FloatImage]] = {
 
 @pytest.mark.parametrize("way", WAYS)
 def test_each_way_of_turning_is_undone_by_the_model_that_is_named_after_it(way: str) -> None:
-    blank = Scene(ArrayImage(DELIVERED), FlatModel(), Acquisition("blank"), 1.0)
-    named = [words for words, _ in turned_scenes(blank)]
+    named = [words for words, _ in turned_scenes(BLANK)]
     assert len(named) == len(WAYS)
     image = np.ascontiguousarray(WAYS[way](DELIVERED))
     fitting = [w for w in named if np.array_equal(pixels_by(w, image), DELIVERED.ravel())]
     assert len(fitting) == 1
     assert fitting[0].startswith(way)
+
+
+@pytest.mark.parametrize(
+    ("found", "agree", "is_turned"), [(12, 12, True), (24, 12, True), (11, 11, False), (25, 12, False)]
+)
+def test_an_image_is_turned_as_the_first_model_says_that_half_of_the_points_agree_on(
+    found: int, agree: int, is_turned: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A dozen at least. A model that finds nothing at all, as the first one here, is left aside."""
+    searched: list[tuple[Scene, RegistrationOptions]] = []
+
+    def search(of: Scene, *given: object) -> tuple[object, object, object]:
+        searched.append((of, given[-1]))  # type: ignore[arg-type]
+        if len(searched) == 1:
+            raise NotEnoughPoints(0, 6, "")
+        count = agree if len(searched) == 3 else 2
+        reason = np.where(np.arange(40) < found, "", "low_score")
+        matches, active = SimpleNamespace(reason=reason), np.arange(40) < count
+        return None, SimpleNamespace(matches=matches), SimpleNamespace(active=active)
+
+    monkeypatch.setattr("amers.services.registration.on_points.search_scene", search)
+    points, chips = control_points(3, np.random.default_rng(0)), MemoryChips(np.zeros((9, 101, 101)))
+    said = _how_it_is_turned(BLANK, points, chips, RegistrationOptions())
+    assert (said != "") == is_turned
+    assert len(searched) == (3 if is_turned else len(WAYS))
+    if is_turned:
+        assert said.startswith("turned by 180 degrees")
+        assert f"by {agree} points that agree then" in said
+
+
+@pytest.mark.parametrize(("points", "views"), [(60, 4), (10, 1)])
+def test_turned_models_are_searched_once_with_few_points_of_few_views(
+    points: int, views: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With no more of them than is asked for, and everything else as it is."""
+    given: list[RegistrationOptions] = []
+
+    def search(*of: object) -> None:
+        given.append(of[-1])  # type: ignore[arg-type]
+        raise NotEnoughPoints(0, 6, "")
+
+    monkeypatch.setattr("amers.services.registration.on_points.search_scene", search)
+    options = RegistrationOptions(
+        coarse=CoarseOptions(points=points, min_score=0.45),
+        matching=MatchingOptions(max_views=views, agreement_px=0.6),
+        seed=3,
+    )
+    none = control_points(3, np.random.default_rng(0)), MemoryChips(np.zeros((9, 101, 101)))
+    assert _how_it_is_turned(BLANK, *none, options) == ""
+    few = replace(
+        options,
+        max_points=60,
+        fine_stages=1,
+        coarse=replace(options.coarse, points=min(points, 24)),
+        matching=replace(options.matching, max_views=min(views, 2)),
+    )
+    assert given == [few] * len(WAYS)
