@@ -42,9 +42,22 @@ def found(pixels: FloatImage) -> list[int]:
 
 @pytest.mark.parametrize("lost", [2, 3, 10, 100, -3, -10, -100])
 def test_lost_and_repeated_lines_are_seen_at_their_line(lost: int) -> None:
+    """From the first line on, and from the last."""
     for seed in range(4):
         line = int(np.random.default_rng(seed).integers(150, LINES - 250))
-        assert found(broken(ground(seed), line, lost)) == [line]
+        pixels = broken(ground(seed), line, lost)
+        assert found(pixels) == [line]
+        assert found(pixels[::-1]) == [len(pixels) - line]
+
+
+@pytest.mark.parametrize(("line", "told"), [(4, False), (8, False), (9, True), (20, True)])
+def test_nearer_than_eight_lines_to_the_first_and_to_the_last_nothing_is_told(
+    line: int, told: bool
+) -> None:
+    for seed in range(4):
+        pixels = broken(ground(seed), line, 30)
+        assert found(pixels) == ([line] if told else [])
+        assert found(pixels[::-1]) == ([len(pixels) - line] if told else [])
 
 
 @pytest.mark.long

@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from amers.services.imagery.jump_sizes import jump_px
+from amers.services.imagery.line_profiles import TransposedImage
 from amers.services.imagery.pixel_checks import (
     Fault,
     PixelFinding,
@@ -81,6 +83,17 @@ def test_lost_lines_are_named_between_their_neighbours(name: str, dtype: str) ->
             (one,) = found(rounded(lost(texture(name, 4), first, count), dtype))
             assert (one.kind, one.line, one.lines) == (Fault.LOST_LINES, first - 1, 2)
             assert one.amount_px >= 1.0
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_so_many_lines_are_lost_as_the_difference_of_others_tells(axis: int) -> None:
+    """Of a ramp, of which lines differ by as many steps as they are apart; 32 of them at most."""
+    ramp = np.arange(400.0, dtype=np.float32)[:, None] * np.ones(200, np.float32)
+    for count in (1, 2, 7, 31, 32, 40):
+        for first in (50, 150):
+            pixels = lost(ramp, first, count)
+            image = ArrayImage(pixels) if axis == 0 else TransposedImage(ArrayImage(pixels.T))
+            assert jump_px(image, first) == min(count, 32)
 
 
 def test_lines_repeated_before_a_compression_are_named_as_repeated() -> None:
@@ -228,7 +241,7 @@ def test_blur_and_compression_are_numbers() -> None:
     sharp = pixel_findings(ArrayImage(pixels))
     soft = pixel_findings(ArrayImage(cv2.GaussianBlur(pixels, (0, 0), 1.5)))
     coarse = pixel_findings(ArrayImage(compressed(pixels, 40)))
-    assert soft.blur_px > sharp.blur_px + 0.5
+    assert np.sqrt(soft.blur_px**2 - sharp.blur_px**2) == pytest.approx(1.5, rel=0.1)
     assert sharp.blocking < 0.1 < coarse.blocking
 
 

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from amers.services.joint.block import JointBlock, adjust_together
+from amers.services.joint.fitting import scene_fit
 from amers.services.joint.measured import MeasuredScene
+from amers.services.joint.registration import _uncertainty_m
 from amers.services.joint.results import ground_misfits_m, tie_residual_px
 from amers.services.quality.stability import image_places
 from amers.services.sensors.displacement import DisplacementGrid
-from amers.services.types import Frame, Observations
+from amers.services.types import Array, Frame, Observations
 from tests.services.joint.test_joint_block import FRAME, GSD_M, OPTIONS, SHAPE, observed, truth_of
 
 TIE_NOISE_PX = 0.2
@@ -26,6 +28,38 @@ def scenes_and_ties() -> tuple[list[MeasuredScene], Observations]:
 @cache
 def whole() -> JointBlock:
     return adjust_together(*scenes_and_ties(), OPTIONS)
+
+
+def test_residuals_are_as_large_as_the_positions_of_tie_points_leave_of_what_is_stated() -> None:
+    """Each coordinate in units of its sigma; three of those of a point place it on the ground."""
+    block = whole()
+    vague = replace(block, ties=replace(block.ties, sigma_px=2.0 * block.ties.sigma_px))
+    coordinates = 2.0 * np.bincount(block.ties.point)[block.ties.point]
+    for number in range(3):
+        own, fit = block.of_ties(number), scene_fit(block, number)
+        left = np.sqrt(np.mean(1.0 - 3.0 / coordinates[own]))
+        assert fit.normalised == pytest.approx(left, rel=0.1)
+        assert 0.9 * fit.ties < fit.used_ties < fit.ties == len(own)
+        assert 8 * fit.used_control == pytest.approx(fit.used_ties, rel=0.2)
+        assert scene_fit(vague, number).normalised == pytest.approx(left * 0.6, rel=0.15)
+
+
+def test_a_point_is_as_uncertain_in_a_scene_of_a_block_as_the_model_and_as_its_ground() -> None:
+    block, points = whole(), scenes_and_ties()[0][1].points
+    n = len(points)
+
+    def squares_m2(sigmas_m: tuple[float, float, float]) -> Array:
+        own = replace(points, covariance_m2=np.tile(np.diag(sigmas_m) ** 2, (n, 1, 1)))
+        return _uncertainty_m(block, 1, own) ** 2
+
+    exact, level = squares_m2((0.0, 0.0, 0.0)), squares_m2((3.0, 3.0, 0.0))
+    assert (exact > 0.0).all()
+    assert np.sqrt(exact).max() < 1.0
+    np.testing.assert_allclose(level - exact, 9.0, rtol=0.1)
+    # Seen 8 degrees from the vertical, a height moves a point by its tangent.
+    high = squares_m2((0.0, 0.0, 30.0)) - exact
+    assert (high < 1.1 * (30.0 * np.tan(np.radians(8.0))) ** 2).all()
+    assert (high > 0.4 * (30.0 * np.tan(np.radians(8.0))) ** 2).all()
 
 
 def no_ties() -> Observations:

@@ -153,3 +153,13 @@ def test_no_feature_lies_within_four_pixels_of_an_area_without_data(lost: float)
     distance = np.hypot(*(holed.line_sample - centre).T) - radius
     assert (distance < 30.0).sum() > 20
     assert distance.min() > 3.0
+
+
+@pytest.mark.parametrize("ratio", [1.0, 2.0])
+def test_a_small_image_gives_no_more_features_than_its_pixels_allow(ratio: float) -> None:
+    """So many for a million pixels of the image, at whatever sampling they are found; most are found."""
+    scene = block_views()[0].as_scene(BLOCK_SIGMA_M)
+    allowed = 2_000 * np.prod(scene.image.shape) / 1e6
+    options = FeatureOptions(per_megapixel=2_000, largest_px=50.0)
+    found = find_features(scene, ratio * scene_gsd_m(scene), options)
+    assert 0.6 * allowed < len(found) < 1.2 * allowed

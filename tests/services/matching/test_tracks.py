@@ -72,3 +72,11 @@ def test_tie_points_are_thinned_to_an_even_spread_and_long_ones_stay() -> None:
         assert (after >= np.minimum(before, 5)).all()
     assert np.bincount(cell[kept])[0] < 30
     assert length[np.unique(point[kept])].mean() > length.mean()
+
+
+def test_cells_divide_the_lines_and_the_samples_of_an_image() -> None:
+    """Three by three of 30 lines and 60 samples; what lies beyond the border is in a cell beside it."""
+    at = np.argwhere(np.ones((30, 60)))
+    np.testing.assert_array_equal(image_cells(at, (30, 60), 3), 3 * (at[:, 0] // 10) + at[:, 1] // 20)
+    beyond = np.array([[-0.6, 59.6], [35.0, -9.0], [15.0, 70.0], [9.4, 19.4], [9.6, 19.6]])
+    np.testing.assert_array_equal(image_cells(beyond, (30, 60), 3), [2, 6, 5, 0, 4])
