@@ -51,4 +51,8 @@ def test_every_point_is_active_or_has_a_reason() -> None:
     np.testing.assert_array_equal(found.reason == "deactivated", found.matched & ~found.active)
     assert (found.reason == "deactivated").sum() > 3
     assert set(found.reason[~found.matched]) == {"low_score"}
+    assert not (found.active & ~found.matched).any()
+    for values in (found.line_sample, found.residual_px, found.sigma_px[:, None]):
+        np.testing.assert_array_equal(np.isfinite(values).all(axis=1), found.matched)
+    assert (found.views[found.matched] >= 1).all()
     np.testing.assert_array_equal(found.point_id, measured().points.id)

@@ -69,6 +69,15 @@ def test_a_scene_is_brought_onto_the_reference_from_few_coarse_places_to_all_fin
     assert last.displacement_rms_m < 0.2
 
 
+@pytest.mark.parametrize(("samples", "tried"), [(130, 100), (170, 36)])
+def test_all_places_lead_where_less_than_a_quarter_of_the_few_are_seen(samples: int, tried: int) -> None:
+    """Two columns of six are a third of them."""
+    of = scene(OFF_M, SIGMA_M)
+    pixels = of.image.read(Window(0, 0, 400, 400))
+    pixels[:, samples:] = np.nan
+    assert stages_of(replace(of, image=ArrayImage(pixels)))[0].tried == tried
+
+
 @pytest.mark.parametrize(
     ("settled_px", "fine_stages", "count"), [(0.25, 3, 2), (0.0, 2, 3), (0.0, 3, 4)]
 )
