@@ -8,10 +8,10 @@ from amers.services.errors import InputError
 from amers.services.imagery.source import ArrayImage, Window
 from amers.services.simulation.defects import Damage, DamagedImage
 from amers.services.simulation.detectors import Detectors
-from amers.services.simulation.render import BRIGHTEST, Radiometry
+from amers.services.simulation.render import BRIGHTEST
 from amers.services.simulation.tiles import TILE_PX, TiledView
-from amers.services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
-from amers.services.simulation.world import World, make_world, with_smoother_terrain
+from amers.services.simulation.view import ViewGeometry
+from amers.services.simulation.world import World, with_smoother_terrain
 from amers.services.types import Array
 
 SHAPE = (700, 900)
@@ -19,19 +19,7 @@ WHOLE = Window(0, 0, *SHAPE)
 IMAGE = ArrayImage(
     np.random.default_rng(1).integers(1, BRIGHTEST, SHAPE).astype(np.float32)  # never the largest
 )
-SILENT = Radiometry(noise_floor=0.0, noise_per_signal=0.0)
 rounding = 2.0
-
-
-@pytest.fixture(scope="module")
-def world() -> World:
-    return make_world(np.random.default_rng(3), size_m=600.0, posting_m=0.5)
-
-
-def geometry(world: World) -> ViewGeometry:
-    lon, lat = world.centre_lon_lat.tolist()
-    plan = ViewPlan("view", (lon, lat), (300, 330), 0.5, 15.0, 100.0, radiometry=SILENT)
-    return plan_geometry(world, plan, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("share", [1e-3, 0.05])
@@ -90,8 +78,7 @@ def test_wrong_damage_is_refused(wrong: dict[str, float]) -> None:
         Damage(**wrong)  # type: ignore[arg-type]
 
 
-def test_a_part_of_the_detectors_shows_what_lies_beside(world: World) -> None:
-    taken = geometry(world)
+def test_a_part_of_the_detectors_shows_what_lies_beside(world: World, taken: ViewGeometry) -> None:
     perfect = TiledView(world, taken, 1).read(Window(0, 0, 300, 330))
     steps = np.array([[0.0, 0.0], [2.0, -3.0]])
     detectors = Detectors(steps)
@@ -106,8 +93,7 @@ def test_a_part_of_the_detectors_shows_what_lies_beside(world: World) -> None:
     np.testing.assert_array_equal(detectors.seen(places, 330) - places, steps[[0, 1, 1]])
 
 
-def test_a_blur_is_that_of_the_whole_image_and_has_no_tiles(world: World) -> None:
-    taken = geometry(world)
+def test_a_blur_is_that_of_the_whole_image_and_has_no_tiles(world: World, taken: ViewGeometry) -> None:
     window = Window(0, 0, 300, 330)
     perfect = TiledView(world, taken, 1).read(window)
     blurred = TiledView(world, taken, 1, detectors=Detectors(np.zeros((1, 2)), (1.5, 0.8))).read(window)

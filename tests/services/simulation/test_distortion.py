@@ -14,15 +14,14 @@ from amers.services.simulation.distortion import (
     Step,
     Waves,
 )
-from amers.services.simulation.render import Radiometry, surface_seen
+from amers.services.simulation.render import surface_seen
 from amers.services.simulation.tiles import TiledView
-from amers.services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
-from amers.services.simulation.world import World, make_world
+from amers.services.simulation.view import ViewGeometry
+from amers.services.simulation.world import World
 from amers.services.types import Array, FloatImage
 
 SHAPE = (300, 330)
 WHOLE = Window(0, 0, *SHAPE)
-SILENT = Radiometry(noise_floor=0.0, noise_per_signal=0.0)
 JITTER = Waves(np.array([[2.0, -1.0], [0.5, 0.7]]), np.array([100.0, 170.0]), np.full((2, 2), 0.3))
 CHIRP = Waves(np.array([[0.0, 3.0]]), np.array([150.0]), np.zeros((1, 2)), 1.0 / 300.0)
 BOW = Bend(np.array([[0.0, 0.0], [0.0, 0.0], [4.0, -2.0]]), 0, SHAPE[0])
@@ -48,18 +47,6 @@ DISTORTIONS = {
 rounding = 2.0
 accuracy_of_the_spline = 5e-4  # on white noise of unit variance, whose spline is hardest
 hundredth_of_the_contrast = 0.01
-
-
-@pytest.fixture(scope="module")
-def world() -> World:
-    return make_world(np.random.default_rng(3), size_m=600.0, posting_m=0.5)
-
-
-@pytest.fixture(scope="module")
-def taken(world: World) -> ViewGeometry:
-    lon, lat = world.centre_lon_lat.tolist()
-    plan = ViewPlan("view", (lon, lat), SHAPE, 0.5, 15.0, 100.0, radiometry=SILENT)
-    return plan_geometry(world, plan, np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")

@@ -10,16 +10,11 @@ from amers.services.simulation.conditions import Conditions
 from amers.services.simulation.render import Radiometry
 from amers.services.simulation.tiles import TILE_PX, TiledView
 from amers.services.simulation.view import ViewGeometry, ViewPlan, plan_geometry, render_view
-from amers.services.simulation.world import World, make_world
+from amers.services.simulation.world import World
 
 SHAPE = (210, 333)
 ROUNDED_OTHERWISE = 1e-4
 """Share of the pixels whose light lies so close to half a number that its last digits decide."""
-
-
-@pytest.fixture(scope="module")
-def world() -> World:
-    return make_world(np.random.default_rng(3), size_m=600.0, posting_m=0.5)
 
 
 def geometry(world: World, gsd_m: float = 0.5, **changes: object) -> ViewGeometry:
