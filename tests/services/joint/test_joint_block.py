@@ -38,6 +38,7 @@ from benchmarks._joint_scenes import (
     places,
     tie_points,
 )
+from tests.services.ties import whitened_square
 
 OPTIONS = RegistrationOptions()
 SHAPE, GSD_M = (8000, 8000), 0.5
@@ -74,6 +75,15 @@ def observed(truth: JointTruth, rng: np.random.Generator) -> tuple[list[Measured
     return scenes, tie_points(truth.images, places(rng, origin(), EXTENT_M, 900, 60.0), rng)
 
 
+def adjusted(seed: int | list[int], **last: object) -> tuple[JointTruth, JointBlock]:
+    """A block of which all scenes fit."""
+    rng = np.random.default_rng(seed)
+    truth = truth_of(rng, **last)  # type: ignore[arg-type]
+    block, left = adjust_fitting(*observed(truth, rng), OPTIONS)
+    assert not left
+    return truth, block
+
+
 def normalised(truth: JointTruth, block: JointBlock, number: int) -> tuple[float, float]:
     """Mean squares of the errors at corners and centre over what is declared: relative, on the Earth."""
     adjustment = scene_adjustment(block, number, OPTIONS)
@@ -83,21 +93,15 @@ def normalised(truth: JointTruth, block: JointBlock, number: int) -> tuple[float
     covariance = adjustment.covariance_at(at)
     ground = model.locate(at, np.full(len(at), origin()[2]))
     of_frame = frame_in_image(FRAME, model.project_derivative(ground), 0.0)
-    return tuple(
-        float((error * np.linalg.solve(stated, error[:, :, None])[:, :, 0]).sum(axis=1).mean() / 2.0)
-        for error, stated in ((relative, covariance), (earth, covariance + of_frame))
-    )  # type: ignore[return-value]
+    on_earth = whitened_square(earth, covariance + of_frame).mean()
+    return float(whitened_square(relative, covariance).mean()), float(on_earth)
 
 
 @pytest.mark.monte_carlo
 def test_errors_are_those_stated_relative_and_on_the_earth() -> None:
     squares = []
     for trial in range(TRIALS):
-        rng = np.random.default_rng([1, trial])
-        truth = truth_of(rng)
-        scenes, ties = observed(truth, rng)
-        block, left = adjust_fitting(scenes, ties, OPTIONS)
-        assert not left
+        truth, block = adjusted([1, trial])
         squares += [normalised(truth, block, number) for number in range(3)]
     relative, earth = np.mean(squares, axis=0)
     assert 0.4 < relative < 1.5
@@ -150,15 +154,10 @@ def test_a_scene_that_oscillates_is_followed_with_the_stated_accuracy(
     side = np.linspace(0.03, 0.97, 9) * SHAPE[0]
     at = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
     for trial in range(TRIALS):
-        rng = np.random.default_rng([5, trial])
-        truth = truth_of(rng, wave_px=wave_px)
-        scenes, ties = observed(truth, rng)
-        block, left = adjust_fitting(scenes, ties, OPTIONS)
-        assert not left
+        truth, block = adjusted([5, trial], wave_px=wave_px)
         error, _ = errors_px(truth, 2, block.model(2), at)
         stated = scene_adjustment(block, 2, OPTIONS).covariance_at(at)
-        square = (error * np.linalg.solve(stated, error[:, :, None])[:, :, 0]).sum(axis=1) / 2.0
-        squares.append(float(square.mean()))
+        squares.append(float(whitened_square(error, stated).mean()))
         errors.append(float(np.quantile(np.hypot(*error.T), 0.9)))
         assert max(normalised(truth, block, number)[0] for number in range(2)) < 4.0
     assert 0.5 < np.mean(squares) < 1.7
@@ -190,9 +189,7 @@ def test_a_scene_of_other_ground_is_named() -> None:
 
 
 def test_a_repetition_without_holding_anything_out_is_the_block() -> None:
-    rng = np.random.default_rng(6)
-    truth = truth_of(rng)
-    block, _ = adjust_fitting(*observed(truth, rng), OPTIONS)
+    _, block = adjusted(6)
     again = repeated(block, [np.zeros(0, dtype=np.int64)] * 3, None)
     for number in range(3):
         at = image_places(SHAPE)
@@ -204,12 +201,9 @@ def test_a_repetition_without_holding_anything_out_is_the_block() -> None:
 
 
 def test_every_scene_is_qualified_with_the_stability_of_the_block() -> None:
-    rng = np.random.default_rng(6)
-    truth = truth_of(rng)
-    scenes, ties = observed(truth, rng)
-    block, _ = adjust_fitting(scenes, ties, OPTIONS)
+    _, block = adjusted(6)
     measures = [scene_measures(block, number, OPTIONS) for number in range(3)]
-    draws = held_draws(measures, 3, 0.8, rng)
+    draws = held_draws(measures, 3, 0.8, np.random.default_rng(6))
     drawn = [(held, repeated(block, held, None)) for held in draws]
     registration = registered_scene(block, 0, OPTIONS, drawn=drawn, cells=[])
     stability = registration.qualification.stability
@@ -218,7 +212,7 @@ def test_every_scene_is_qualified_with_the_stability_of_the_block() -> None:
     largest_m = max(place.max_m for place in stability.displacements)
     assert 0.0 < largest_m < 1.0
     assert registration.qualification.verdict in ("good", "usable")
-    assert scene_gsd_m(scenes[0].scene) == pytest.approx(GSD_M, rel=0.1)
+    assert scene_gsd_m(block.scenes[0].scene) == pytest.approx(GSD_M, rel=0.1)
     assert held_cells(measures)
 
 
@@ -241,7 +235,7 @@ def test_a_scene_that_joins_agrees_with_one_adjustment_of_all_scenes() -> None:
         one, other = (scene_adjustment(each, 2, OPTIONS) for each in (joined, redone))
         moved_px = one.correction.apply(at) - other.correction.apply(at)
         stated = one.covariance_at(at)
-        squares.append((moved_px * np.linalg.solve(stated, moved_px[:, :, None])[:, :, 0]).sum() / 10.0)
+        squares.append(whitened_square(moved_px, stated).mean())
         accurate.append(normalised(truth, joined, 2)[0])
     assert np.mean(squares) < 0.5
     assert 0.1 < np.mean(accurate) < 2.5
@@ -265,7 +259,7 @@ def test_a_scene_that_joins_an_oscillating_one_is_tied_to_what_that_scene_truly_
         one, other = (scene_adjustment(each, 0, OPTIONS) for each in (joined, redone))
         moved_px = one.correction.apply(at) - other.correction.apply(at)
         stated = one.covariance_at(at)
-        squares.append((moved_px * np.linalg.solve(stated, moved_px[:, :, None])[:, :, 0]).sum() / 10.0)
+        squares.append(whitened_square(moved_px, stated).mean())
     assert np.mean(squares) < 0.5
 
 

@@ -31,6 +31,7 @@ from tests.services.joint.test_rigorous_scenes import (
     plan_of,
     rigorous_truth,
 )
+from tests.services.ties import whitened_square
 
 TRIALS = 5
 
@@ -65,9 +66,7 @@ def squares_of(true: ParameterSet, stated: ParameterSet) -> tuple[float, float, 
         found = of_left_out_terms(block, with_every_term_free(block, OPTIONS, None), 0)
         harm_px = np.zeros(2) if found is None else found.harm_px
         for squares, own in ((without, covariance), (beside, covariance + np.diag(harm_px**2))):
-            squares.append(
-                (error * np.linalg.solve(own, error[:, :, None])[:, :, 0]).sum(axis=1).mean() / 2.0
-            )
+            squares.append(whitened_square(error, own).mean())
         harm.append(float(np.hypot(*harm_px)))
     return float(np.mean(without)), float(np.mean(beside)), float(np.median(harm))
 

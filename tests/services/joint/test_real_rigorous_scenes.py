@@ -35,6 +35,7 @@ from benchmarks._joint_scenes import (
     places,
     tie_points,
 )
+from tests.services.ties import whitened_square
 
 pytestmark = pytest.mark.real_data
 
@@ -128,8 +129,7 @@ def test_an_adjusted_orbit_agrees_with_the_rpc_of_the_vendor(real_data: Path) ->
             at = image_places(image.shape) * 0.8 + 0.1 * size
             error, _ = errors_px(truth, number, block.model(number), at)
             stated = scene_adjustment(block, number, OPTIONS).covariance_at(at)
-            whitened = np.linalg.solve(stated, error[:, :, None])[:, :, 0]
-            squares.append((error * whitened).sum(axis=1).mean() / 2.0)
+            squares.append(whitened_square(error, stated).mean())
             largest_px.append(np.hypot(*error.T).max())
     assert np.max(largest_px) < 0.6
     assert np.mean(squares) < 2.5

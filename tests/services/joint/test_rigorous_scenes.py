@@ -37,6 +37,7 @@ from benchmarks._joint_scenes import (
     places,
     tie_points,
 )
+from tests.services.ties import whitened_square
 
 pytestmark = pytest.mark.thorough
 
@@ -141,7 +142,7 @@ def normalised(truth: JointTruth, block: JointBlock, number: int) -> float:
     at = image_places(shape) * 0.98 + 0.01 * np.array(shape)
     error, _ = errors_px(truth, number, block.model(number), at)
     stated = scene_adjustment(block, number, OPTIONS).covariance_at(at)
-    return float((error * np.linalg.solve(stated, error[:, :, None])[:, :, 0]).sum(axis=1).mean() / 2.0)
+    return float(whitened_square(error, stated).mean())
 
 
 def largest_m(truth: JointTruth, block: JointBlock, number: int) -> float:
@@ -203,8 +204,7 @@ def test_a_rigorous_scene_that_joins_agrees_with_one_adjustment_of_all_scenes() 
             ground = redone.model(new).locate(at, np.full(len(at), origin()[2]))
             moved_px = joined.model(last).project(ground) - at
             stated = scene_adjustment(joined, last, OPTIONS).covariance_at(at)
-            square = (moved_px * np.linalg.solve(stated, moved_px[:, :, None])[:, :, 0]).sum() / 10.0
-            squares.append(square)
+            squares.append(whitened_square(moved_px, stated).mean())
             one = replace(truth, images=tuple(truth.images[k] for k in order))
             accurate.append(normalised(one, joined, last))
     assert np.mean(squares) < 0.6
@@ -290,8 +290,7 @@ def test_a_rigorous_scene_that_oscillates_is_followed_with_the_stated_accuracy(
         assert isinstance(model, PushbroomModel)
         error, _ = errors_px(truth, 0, model, at)
         stated = scene_adjustment(block, 0, OPTIONS).covariance_at(at)
-        square = (error * np.linalg.solve(stated, error[:, :, None])[:, :, 0]).sum(axis=1) / 2.0
-        squares.append(float(square.mean()))
+        squares.append(float(whitened_square(error, stated).mean()))
         errors.append(float(np.quantile(np.hypot(*error.T), 0.9)))
         nearest = nearest_correction(block, 0)
         assert nearest.correction.displacement is not None
@@ -336,8 +335,7 @@ def test_a_rigorous_scene_that_lost_lines_is_right_on_both_sides_of_them() -> No
         at = at[np.abs(at[:, 0] - 0.5 * SHAPE[0]) > 2000.0]
         error, _ = errors_px(truth, 0, block.model(0), at)
         stated = scene_adjustment(block, 0, OPTIONS).covariance_at(at)
-        square = (error * np.linalg.solve(stated, error[:, :, None])[:, :, 0]).sum(axis=1) / 2.0
-        squares.append(float(square.mean()))
+        squares.append(float(whitened_square(error, stated).mean()))
         errors.append(float(np.quantile(np.hypot(*error.T), 0.9)))
     assert 0.5 < np.mean(squares) < 2.5
     assert np.median(errors) < 1.0
