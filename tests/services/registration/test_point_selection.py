@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from amers.services.conventions import CHIP_CENTRE
-from amers.services.errors import CoverageError, OtherGround
+from amers.services.errors import CoverageError, InputError, OtherGround
 from amers.services.geodesy import move_metres
 from amers.services.imagery.scene import Scene, scene_gsd_m
 from amers.services.imagery.source import ArrayImage
 from amers.services.matching.chip_extent import MIN_VISIBLE_SIDE
-from amers.services.registration.chip_selection import visibility_probability
+from amers.services.registration.chip_selection import fine_gsd_m, has_chip, visibility_probability
 from amers.services.registration.context import Prediction
+from amers.services.registration.options import CoarseOptions
 from amers.services.registration.point_selection import (
     initial_prediction,
     points_expected,
@@ -43,6 +44,16 @@ def points_around() -> ControlPoints:
     """Points of a square kilometre around the scene, with chips of a metre and of four."""
     west, south, east, north = np.concatenate([CENTRE - [0.006, 0.0045], CENTRE + [0.006, 0.0045]])
     return control_points(120, np.random.default_rng(1), (west, south, east, north), gsds_m=(1.0, 4.0))
+
+
+def scene_of(lines: int, gsd_m: float) -> Scene:
+    """A scene of so many lines and samples of a size around the same middle."""
+    model = replace(
+        small_scene().model, image_offset=np.full(2, lines / 2.0), image_scale=np.full(2, 5000.0 / gsd_m)
+    )  # type: ignore[type-var]
+    return replace(
+        small_scene(), model=model, image=ArrayImage(np.zeros((lines, lines), dtype=np.float32))
+    )
 
 
 def enough_shown(scene: Scene, line_sample: Array) -> BoolArray:
@@ -219,3 +230,49 @@ def test_points_for_which_the_model_has_no_position_change_nothing_for_the_other
     assert known[~lost].max() > 0.1
     np.testing.assert_allclose(some, np.where(lost, 0.0, known), atol=2e-3)
     assert not none.any()
+
+
+def test_the_probability_of_being_shown_is_that_of_many_draws() -> None:
+    points, scene, sigma_m = points_around(), small_scene(), 40.0
+    line_sample = scene.model.project(points.lon_lat_h)
+    prediction = prediction_within(sigma_m, scene, points)
+    probability = visibility_probability(scene, points, prediction, 1.0)
+    derivative = np.abs(scene.model.project_derivative(points.lon_lat_h[:1])[0, :, :2])
+    reach_px = CHIP_CENTRE * derivative.sum(axis=1)
+    sigma_px = sigma_m / scene_gsd_m(scene)
+    drawn = np.random.default_rng(1).normal(0.0, sigma_px, (5000, 1, 2)) + line_sample
+    last_px = SIZE_PX - 1.0 - reach_px
+    shown = ((drawn >= reach_px) & (drawn <= last_px)).all(axis=2).mean(axis=0)
+    np.testing.assert_allclose(probability, shown, atol=0.02)
+    assert probability.max() > 0.8
+
+
+@pytest.mark.parametrize(
+    ("lines", "gsd_m", "expected_m"),
+    [(2800, 1.0, 1.0), (700, 4.0, 4.0), (150, 4.0, 1.0), (700, 3.1, 1.0), (700, 3.4, 4.0)],
+    ids=["fine scene", "coarse", "smaller than two chips", "between the chips", "nearly as coarse"],
+)
+def test_chips_are_as_coarse_as_the_scene_where_it_shows_them(
+    lines: int, gsd_m: float, expected_m: float
+) -> None:
+    points, scene = points_around(), scene_of(lines, gsd_m)
+    assert fine_gsd_m(scene, points, prediction_within(5.0, scene, points)) == expected_m
+
+
+@pytest.mark.parametrize(("share", "expected_m"), [(0.7, 1.0), (0.9, 4.0)])
+def test_coarse_chips_of_few_points_are_left_for_the_finer_ones_of_all(
+    share: float, expected_m: float
+) -> None:
+    """Four of five points that the scene shows are enough."""
+    points, scene = points_around(), scene_of(700, 4.0)
+    few, owner = int(share * len(points)), np.repeat(np.arange(len(points)), 6)
+    gsd_m = np.where(owner < few, points.views.gsd_m, 1.0)
+    mixed = replace(points, views=replace(points.views, gsd_m=gsd_m))
+    assert has_chip(mixed, 4.0).sum() == few
+    assert fine_gsd_m(scene, mixed, prediction_within(5.0, scene, mixed)) == expected_m
+
+
+@pytest.mark.parametrize("name", ["points", "max_search_px", "max_reduction"])
+def test_options_no_search_can_be_made_with_are_refused(name: str) -> None:
+    with pytest.raises(InputError, match=f"{name}: 0 given, 1 or more expected"):
+        CoarseOptions(**{name: 0})
