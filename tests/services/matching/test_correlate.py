@@ -5,7 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from amers.services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip
+from amers.services.matching.correlate import (
+    FOUND,
+    CorrelationOptions,
+    Peak,
+    _largest_sigma_px,
+    find_chip,
+)
 from amers.services.types import Array, FloatImage
 from tests.services.textures import as_pixels, moved, texture
 
@@ -204,3 +210,11 @@ def test_nodata_away_from_a_chip_does_not_move_it() -> None:
     beside = find_chip(patch, chip_of(ground), OPTIONS)
     assert beside.reason == FOUND
     np.testing.assert_allclose(beside.row_col, whole.row_col, atol=a_millipixel)
+
+
+def test_the_largest_sigma_is_that_along_the_worst_direction() -> None:
+    """Of covariances with correlation: the root of their larger eigenvalue."""
+    for factor in np.random.default_rng(3).normal(size=(20, 2, 2)):
+        covariance = factor @ factor.T
+        expected = np.sqrt(np.linalg.eigvalsh(covariance)[-1])
+        assert _largest_sigma_px(covariance) == pytest.approx(expected)
