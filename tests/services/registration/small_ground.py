@@ -9,6 +9,7 @@ import numpy as np
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage, CachedImage, Window, render_chip
 from amers.services.map_grid import MapGrid
+from amers.services.matching.control_points import PointMatches
 from amers.services.matching.multi_image import stored_chip
 from amers.services.registration.context import PointContext, Prediction, RegistrationContext
 from amers.services.registration.options import CoarseOptions, RegistrationOptions
@@ -20,6 +21,7 @@ from amers.services.types import (
     Array,
     ControlPoints,
     FloatImage,
+    ViewMeasures,
     Views,
     no_progress,
 )
@@ -93,6 +95,23 @@ def many_points() -> tuple[ControlPoints, MemoryChips]:
     """Points every 110 m, also far beside the scene."""
     axis = np.arange(55.0, SIDE_PX - 55.0, 55.0)
     return points_at(np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2))
+
+
+def matches_at(line_sample: Array, displacement_m: Array, sigma_px: float) -> PointMatches:
+    """Matches (n,) of points by a view each; NaN where they were not found."""
+    n, nothing = len(line_sample), np.zeros(0, dtype=np.int64)
+    found = np.isfinite(line_sample).all(axis=1)
+    return PointMatches(
+        line_sample=line_sample,
+        displacement_m=displacement_m,
+        sigma_px=np.where(found, sigma_px, np.nan),
+        score=np.ones(n),
+        views=np.ones(n, dtype=np.int64),
+        reason=np.where(found, "", "low_score").astype("<U16"),
+        by_gradient=np.zeros(n, dtype=bool),
+        common_covariance_m2=np.zeros((2, 2)),
+        view_measures=ViewMeasures(nothing, nothing, np.zeros(0), np.zeros(0, bool), np.zeros(0, str)),
+    )
 
 
 def context_of(of: Scene, **coarse: float) -> RegistrationContext:

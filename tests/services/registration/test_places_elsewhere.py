@@ -8,7 +8,7 @@ import pytest
 from amers.services.conventions import CHIP_SIZE
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage, CachedImage, Window
-from amers.services.matching.control_points import ChipSearch, PointMatches, match_points
+from amers.services.matching.control_points import ChipSearch, match_points
 from amers.services.misfit.scene_adjustment import AdjustmentOptions
 from amers.services.quality.points_elsewhere import Elsewhere
 from amers.services.registration.context import PointContext
@@ -21,13 +21,12 @@ from amers.services.types import (
     BoolArray,
     ChipArray,
     ControlPoints,
-    ViewMeasures,
     no_progress,
 )
 from tests.factories import control_points
 from tests.services.conftest import GSD_M, SHAPE, FlatModel
 from tests.services.registration.small_ground import GSD_M as GRID_M
-from tests.services.registration.small_ground import point_context, points_at, scene, whole
+from tests.services.registration.small_ground import matches_at, point_context, points_at, scene, whole
 from tests.services.simulated import MemoryChips
 
 NOISE_PX = 0.2
@@ -55,18 +54,8 @@ def named(off_px: Array, place: Array, height_m: Array | None = None) -> Elsewhe
     )
     line_sample = place + off_px + NOISE_PX * rng.uniform(-EVENLY, EVENLY, (n, 2))
     found = np.isfinite(off_px).all(axis=1)
-    nothing = np.zeros(0, dtype=np.int64)
-    matches = PointMatches(
-        line_sample=line_sample,
-        displacement_m=(line_sample - place)[:, ::-1] * [GSD_M, -GSD_M],
-        sigma_px=np.where(found, NOISE_PX, np.nan),
-        score=np.ones(n),
-        views=np.ones(n, dtype=np.int64),
-        reason=np.where(found, "", "low_score").astype("<U16"),
-        by_gradient=np.zeros(n, dtype=bool),
-        common_covariance_m2=np.zeros((2, 2)),
-        view_measures=ViewMeasures(nothing, nothing, np.zeros(0), np.zeros(0, bool), np.zeros(0, str)),
-    )
+    displacement_m = (line_sample - place)[:, ::-1] * [GSD_M, -GSD_M]
+    matches = matches_at(line_sample, displacement_m, NOISE_PX)
     blank = ArrayImage(np.broadcast_to(np.float32(0.0), SHAPE))
     scene = Scene(blank, FlatModel(), Acquisition("flat"), 10.0)
     options = RegistrationOptions(adjustment=AdjustmentOptions(order="drift", min_points=6))

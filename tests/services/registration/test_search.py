@@ -11,7 +11,6 @@ from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage
 from amers.services.map_grid import MapGrid
 from amers.services.matching.consensus import Consensus, Voters
-from amers.services.matching.control_points import PointMatches
 from amers.services.registration.context import SearchStage
 from amers.services.registration.search import (
     check_consensus,
@@ -23,10 +22,11 @@ from amers.services.registration.search import (
 from amers.services.sensors.base import SensorModel
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.simulation.orbit import pushbroom_over
-from amers.services.types import Acquisition, Array, ViewMeasures
+from amers.services.types import Acquisition, Array
 from tests.factories import control_points
 from tests.services.conftest import GSD_M as FLAT_GSD_M
 from tests.services.conftest import SHAPE, FlatModel, register
+from tests.services.registration.small_ground import matches_at
 
 LINES, GSD_M = 5000, 20.0
 SHIFT_PX = np.array([180.0, -165.0])
@@ -88,24 +88,13 @@ def test_a_candidate_of_a_refused_search_is_one_group_over_converging_meridians(
     displacement_m = east_north_m(scene.model, predicted, predicted + SHIFT_PX)
     spread_m = np.hypot(*(displacement_m - displacement_m.mean(axis=0)).T).max()
     assert spread_m > of_three_level_pixels, "east and north of each place would split them"
-    n = len(predicted)
-    found = np.arange(n) % 4 > 0
-    nothing = np.zeros(0, dtype=np.int64)
-    matches = PointMatches(
-        line_sample=np.where(found[:, None], predicted + SHIFT_PX, np.nan),
-        displacement_m=np.where(found[:, None], displacement_m, np.nan),
-        sigma_px=np.full(n, 0.1),
-        score=np.ones(n),
-        views=np.ones(n, dtype=np.int64),
-        reason=np.where(found, "", "low_score"),
-        by_gradient=np.zeros(n, dtype=bool),
-        common_covariance_m2=np.zeros((2, 2)),
-        view_measures=ViewMeasures(nothing, nothing, np.zeros(0), np.zeros(0, bool), np.zeros(0, str)),
-    )
+    found = np.arange(len(predicted)) % 4 > 0
+    shown = np.where(found[:, None], predicted + SHIFT_PX, np.nan)
+    matches = matches_at(shown, np.where(found[:, None], displacement_m, np.nan), 0.1)
     refused = summarise(
         "coarse",
         matches,
-        np.zeros(n, dtype=bool),
+        np.zeros(len(found), dtype=bool),
         level_m=LEVEL_M,
         radius_m=5_000.0,
         needed_m=5_000.0,
@@ -151,22 +140,35 @@ def test_points_of_which_no_two_agree_are_refused_in_words(inliers: int) -> None
     assert "no two of them agree" in message
 
 
-def test_peaks_at_the_border_ask_for_a_larger_sigma() -> None:
-    message = refusal(stage(at_border=40, matched=10))
-    assert "40 best peaks lie at the border of the search" in message
-    assert "try --sigma-m 200" in message
+REFERENCE = "the reference does not agree with the scene on one correction: 60 places tried"
+COARSE = "the coarse search does not agree on one correction: 60 points tried"
 
 
-def test_a_refusal_by_a_reference_image_speaks_of_its_places() -> None:
-    message = refusal(stage(name="reference"))
-    assert "the reference does not agree with the scene on one correction: 60 places tried" in message
-    assert "the coarse search does not agree on one correction: 60 points tried" in refusal(stage())
-
-
-def test_a_refusal_names_the_middle_that_was_searched_of_a_scene_too_large_for_it() -> None:
-    message = refusal(stage(middle_m=20_000.0))
-    assert "in the middle 20.0 km of the scene only" in message
-    assert "give points with coarser chips" in message
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"at_border": 40, "matched": 10}, ("40 best peaks lie at the border", "try --sigma-m 200")),
+        ({"at_border": 31}, ("31 best peaks lie at the border of the search",)),
+        ({"at_border": 30}, ("check that the points show the ground", "try --sigma-m 200")),
+        ({"name": "reference"}, (REFERENCE,)),
+        ({}, (COARSE,)),
+        ({"middle_m": 20_000.0}, ("in the middle 20.0 km of the scene only", "with coarser chips")),
+        ({"matched": 6, "at_border": 0}, ("next to none of the points is seen",)),
+        (
+            {"needed_radius_m": 5_000.0, "search_radius_m": 3_300.0},
+            ("reached 3300 m of the 5000 m", "try --sigma-m 1100"),
+        ),
+        # The radius of a search is a few pixels at least, which says more than a small sigma.
+        ({"search_radius_m": 606.0, "needed_radius_m": 606.0}, ("try --sigma-m 400",)),
+        ({"search_radius_m": 594.0, "needed_radius_m": 594.0}, ("try --sigma-m 200",)),
+    ],
+)
+def test_a_refusal_says_what_was_seen_and_what_to_try(
+    changes: dict[str, object], told: tuple[str, ...]
+) -> None:
+    message = refusal(stage(**changes))
+    for words in told:
+        assert words in message
 
 
 @pytest.mark.parametrize(
@@ -225,12 +227,6 @@ def test_chance_is_that_of_displacements_that_a_search_can_find(
         expected.append(consensus.false_alarms)
     # Each of six points is expected to find another one: a pair counts twice.
     assert 0.75 < np.mean(expected) / (2.0 * happens) < 1.4
-
-
-def test_a_limited_search_says_how_far_it_reached() -> None:
-    limited = stage(needed_radius_m=5_000.0, search_radius_m=3_200.0)
-    assert limited.limited
-    assert "reached 3200 m of the 5000 m" in refusal(limited)
 
 
 def test_a_point_still_to_be_found_may_be_as_far_off_as_the_points_found() -> None:
