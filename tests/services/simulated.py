@@ -19,7 +19,15 @@ from amers.services.simulation.view import (
 )
 from amers.services.simulation.world import World, make_world
 from amers.services.tasks import Work
-from amers.services.types import ChipArray, ControlPoints, Observations
+from amers.services.types import (
+    UNKNOWN_FRAME,
+    Acquisition,
+    Array,
+    ChipArray,
+    ControlPoints,
+    Observations,
+    Views,
+)
 
 SHAPE = (700, 700)
 GSD_M = 1.0
@@ -76,6 +84,46 @@ class MemoryChips:
 
     def read(self, file: str, row: int, count: int) -> ChipArray:
         return self.chips[row : row + count]
+
+
+def views_of_points(
+    count: int,
+    gsds_m: Sequence[float],
+    incidence_deg: float | Sequence[float] = 0.0,
+    azimuth_deg: float = 0.0,
+    *,
+    image: int | Sequence[int] = 0,
+    images: tuple[Acquisition, ...] = (Acquisition("ground"),),
+) -> Views:
+    """Views of points which all have the same: one at each ground sampling."""
+    each = len(gsds_m)
+    return Views(
+        start=each * np.arange(count + 1),
+        gsd_m=np.tile(gsds_m, count),
+        image=np.tile(np.broadcast_to(image, each), count),
+        incidence_deg=np.tile(np.broadcast_to(incidence_deg, each), count),
+        azimuth_deg=np.full(each * count, azimuth_deg),
+        health=np.ones(each * count),
+        images=images,
+    )
+
+
+def points_with(lon_lat_h: Array, views: Views, sigma_m: float) -> ControlPoints:
+    """Points of one block, as precise in each coordinate, whose chips are in the rows of their views."""
+    n = len(lon_lat_h)
+    return ControlPoints(
+        id=np.arange(n),
+        lon_lat_h=lon_lat_h,
+        covariance_m2=np.tile(sigma_m**2 * np.eye(3), (n, 1, 1)),
+        block=np.zeros(n, dtype=np.int64),
+        frames=(UNKNOWN_FRAME,),
+        saliency=np.ones(n),
+        health=np.ones(n),
+        views=views,
+        chip_file=np.zeros(n, dtype=np.int64),
+        chip_row=views.start[:-1],
+        chip_files=("chips",),
+    )
 
 
 @cache

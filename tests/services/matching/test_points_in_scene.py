@@ -16,9 +16,9 @@ from amers.services.matching.control_points import (
 )
 from amers.services.matching.correlate import FOUND
 from amers.services.sensors.ortho import OrthoModel
-from amers.services.types import Array, ChipArray, ControlPoints, Views
+from amers.services.types import Array, ChipArray, ControlPoints
 from tests.services.registration.small_ground import GSD_M, points_at, scene
-from tests.services.simulated import MemoryChips
+from tests.services.simulated import MemoryChips, views_of_points
 
 SIDE = 400
 FIRST = (1024 - SIDE) // 2
@@ -135,15 +135,7 @@ def several_views() -> tuple[ControlPoints, MemoryChips]:
     noise = rng.normal(0.0, 30.0, (2, *chips.chips.shape))
     shown = [np.maximum(chips.chips + one, 1.0).astype(np.uint16) for one in noise]
     stacked = np.stack([shown[0], np.roll(chips.chips, 3, axis=0), shown[1]], axis=1)
-    views = Views(
-        start=3 * np.arange(n + 1),
-        gsd_m=np.full(3 * n, GSD_M),
-        image=np.zeros(3 * n, dtype=np.int64),
-        incidence_deg=np.tile([9.0, 3.0, 6.0], n),
-        azimuth_deg=np.zeros(3 * n),
-        health=np.ones(3 * n),
-        images=points.views.images,
-    )
+    views = views_of_points(n, [GSD_M] * 3, [9.0, 3.0, 6.0])
     rows: ChipArray = stacked.reshape(-1, *stacked.shape[2:])
     return replace(points, views=views, chip_row=3 * np.arange(n)), MemoryChips(rows)
 
@@ -172,15 +164,8 @@ def common_px(off_px: float) -> float:
     _, displaced = points_at(GRID + [0.0, off_px])
     n = len(points)
     stacked = np.stack([chips.chips, displaced.chips], axis=1)
-    views = Views(
-        start=2 * np.arange(n + 1),
-        gsd_m=np.full(2 * n, GSD_M),
-        image=np.tile([0, 1], n),
-        incidence_deg=np.zeros(2 * n),
-        azimuth_deg=np.zeros(2 * n),
-        health=np.ones(2 * n),
-        images=(points.views.images[0], replace(points.views.images[0], image_id="second")),
-    )
+    images = (points.views.images[0], replace(points.views.images[0], image_id="second"))
+    views = views_of_points(n, [GSD_M] * 2, image=[0, 1], images=images)
     both = replace(points, views=views, chip_row=2 * np.arange(n))
     of = scene(OFF_M, 10.0)
     of = replace(of, acquisition=replace(of.acquisition, incidence_deg=0.0, azimuth_deg=0.0))

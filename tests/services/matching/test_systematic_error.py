@@ -13,6 +13,7 @@ from amers.services.matching.systematic_error import (
     common_covariance_px2,
 )
 from amers.services.types import Acquisition, Array, BoolArray, Views
+from tests.services.simulated import views_of_points
 
 NORTH, EAST, SOUTH = 0.0, 90.0, 180.0
 NINETY_PERCENT = 2.0 * np.log(10.0)
@@ -22,15 +23,7 @@ LIKE_THE_SCENE = Acquisition("scene", "", None, 20.0, NORTH, 60.0, SOUTH)
 
 
 def views_of(image: Acquisition, count: int = 20) -> Views:
-    return Views(
-        np.arange(count + 1),
-        np.full(count, 2.0),
-        np.zeros(count, dtype=np.int64),
-        np.full(count, image.incidence_deg),
-        np.full(count, image.azimuth_deg),
-        np.ones(count),
-        (image,),
-    )
+    return views_of_points(count, [2.0], image.incidence_deg, image.azimuth_deg, images=(image,))
 
 
 def common(image: Acquisition, offset: Array | None = None) -> Array:

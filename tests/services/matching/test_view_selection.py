@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from amers.services.matching.view_selection import ViewDistanceScales, select_views, view_distances
-from amers.services.types import UNKNOWN_FRAME, Acquisition, ControlPoints, IntArray, Views
+from amers.services.types import Acquisition, ControlPoints, IntArray, Views
+from tests.services.simulated import points_with
 
 SCENE = Acquisition(
     "scene",
@@ -29,27 +30,16 @@ def point_with_views(
 ) -> ControlPoints:
     """One point, with a point of one view before it."""
     m = len(gsd_m)
-    return ControlPoints(
-        id=np.arange(2),
-        lon_lat_h=np.zeros((2, 3)),
-        covariance_m2=np.zeros((2, 3, 3)),
-        block=np.zeros(2, dtype=np.int64),
-        frames=(UNKNOWN_FRAME,),
-        saliency=np.ones(2),
-        health=np.ones(2),
-        views=Views(
-            start=np.array([0, 1, 1 + m]),
-            gsd_m=np.array([gsd_m[0], *gsd_m]),
-            image=np.zeros(1 + m, dtype=np.int64),
-            incidence_deg=np.array([0.0, *incidence_deg]),
-            azimuth_deg=np.array([0.0, *azimuth_deg]),
-            health=np.ones(1 + m),
-            images=(image,),
-        ),
-        chip_file=np.zeros(2, dtype=np.int64),
-        chip_row=np.array([0, 1]),
-        chip_files=("chips",),
+    views = Views(
+        start=np.array([0, 1, 1 + m]),
+        gsd_m=np.array([gsd_m[0], *gsd_m]),
+        image=np.zeros(1 + m, dtype=np.int64),
+        incidence_deg=np.array([0.0, *incidence_deg]),
+        azimuth_deg=np.array([0.0, *azimuth_deg]),
+        health=np.ones(1 + m),
+        images=(image,),
     )
+    return points_with(np.zeros((2, 3)), views, 0.0)
 
 
 def numbers(points: ControlPoints, gsd_m: float, scene: Acquisition, count: int) -> IntArray:

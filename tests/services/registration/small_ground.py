@@ -16,16 +16,14 @@ from amers.services.registration.options import CoarseOptions, RegistrationOptio
 from amers.services.registration.point_selection import initial_prediction
 from amers.services.sensors.ortho import OrthoModel
 from amers.services.types import (
-    UNKNOWN_FRAME,
     Acquisition,
     Array,
     ControlPoints,
     FloatImage,
     ViewMeasures,
-    Views,
     no_progress,
 )
-from tests.services.simulated import MemoryChips
+from tests.services.simulated import MemoryChips, points_with, views_of_points
 from tests.services.textures import as_pixels, texture
 
 SIDE_PX, GSD_M = 1024, 2.0
@@ -65,28 +63,8 @@ def points_at(row_col: Array, gsd_m: float = GSD_M) -> tuple[ControlPoints, Memo
     lon_lat_h = whole().model.locate(row_col, np.zeros(len(row_col)))
     image = whole()
     chips = [stored_chip(render_chip(image.image, image.model, place, gsd_m)) for place in lon_lat_h]
-    n = len(lon_lat_h)
-    points = ControlPoints(
-        id=np.arange(n),
-        lon_lat_h=lon_lat_h,
-        covariance_m2=np.tile(POINT_SIGMA_M**2 * np.eye(3), (n, 1, 1)),
-        block=np.zeros(n, dtype=np.int64),
-        frames=(UNKNOWN_FRAME,),
-        saliency=np.ones(n),
-        health=np.ones(n),
-        views=Views(
-            start=np.arange(n + 1),
-            gsd_m=np.full(n, gsd_m),
-            image=np.zeros(n, dtype=np.int64),
-            incidence_deg=np.zeros(n),
-            azimuth_deg=np.zeros(n),
-            health=np.ones(n),
-            images=(Acquisition("ground"),),
-        ),
-        chip_file=np.zeros(n, dtype=np.int64),
-        chip_row=np.arange(n),
-        chip_files=("chips",),
-    )
+    views = views_of_points(len(lon_lat_h), [gsd_m])
+    points = points_with(lon_lat_h, views, POINT_SIGMA_M)
     return points, MemoryChips(np.array(chips))
 
 

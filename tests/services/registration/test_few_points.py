@@ -10,7 +10,7 @@ from amers.services.registration.coarse import search_coarsely
 from amers.services.registration.on_points import register_scene
 from amers.services.registration.options import RegistrationOptions
 from amers.services.registration.point_selection import points_to_try
-from amers.services.types import Array, ControlPoints, Views
+from amers.services.types import Array, ControlPoints
 from tests.services.registration.small_ground import (
     SIDE_PX,
     point_context,
@@ -18,7 +18,7 @@ from tests.services.registration.small_ground import (
     predicted,
     scene,
 )
-from tests.services.simulated import MemoryChips
+from tests.services.simulated import MemoryChips, views_of_points
 
 OFF_M = np.array([60.0, -42.0])
 SIGMA_M = 25.0
@@ -36,15 +36,7 @@ def with_coarse_chips(row_col: Array) -> tuple[ControlPoints, MemoryChips]:
     (points, fine), (_, coarse) = (points_at(row_col, gsd_m) for gsd_m in (FINE_M, COARSE_M))
     n = len(points)
     chips = np.stack([one.read("chips", 0, n) for one in (fine, coarse)], axis=1)
-    views = Views(
-        start=2 * np.arange(n + 1),
-        gsd_m=np.tile([FINE_M, COARSE_M], n),
-        image=np.zeros(2 * n, dtype=np.int64),
-        incidence_deg=np.zeros(2 * n),
-        azimuth_deg=np.zeros(2 * n),
-        health=np.ones(2 * n),
-        images=points.views.images,
-    )
+    views = views_of_points(n, [FINE_M, COARSE_M])
     return replace(points, views=views, chip_row=2 * points.chip_row), MemoryChips(
         chips.reshape(-1, CHIP_SIZE, CHIP_SIZE)
     )

@@ -14,15 +14,13 @@ from amers.services.sensors.base import SensorModel
 from amers.services.sensors.correction import CorrectedModel, no_correction
 from amers.services.simulation.orbit import pushbroom_over
 from amers.services.types import (
-    UNKNOWN_FRAME,
     Acquisition,
     Array,
     ChipArray,
     ControlPoints,
     FloatImage,
-    IntArray,
-    Views,
 )
+from tests.services.simulated import points_with, views_of_points
 
 CENTRE = np.array([5.4, 43.6, 0.0])
 STEP_M = 2.0
@@ -152,27 +150,7 @@ def wide_points(
     enu[:, :2] += np.random.default_rng(5).uniform(0.0, 0.8 * spacing_m, (len(enu), 2))
     lon_lat_h = lon_lat_h_from_east_north_up(enu, CENTRE)
     lon_lat_h[:, 2] = 0.0
-    n, k = len(lon_lat_h), len(gsds_m)
-    rows: IntArray = np.arange(n, dtype=np.int64)
-    points = ControlPoints(
-        id=rows,
-        lon_lat_h=lon_lat_h,
-        covariance_m2=np.tile(np.diag([0.3, 0.3, 0.3]) ** 2, (n, 1, 1)),
-        block=np.zeros(n, dtype=np.int64),
-        frames=(UNKNOWN_FRAME,),
-        saliency=np.ones(n),
-        health=np.ones(n),
-        views=Views(
-            start=np.arange(n + 1, dtype=np.int64) * k,
-            gsd_m=np.tile(gsds_m, n),
-            image=np.zeros(n * k, dtype=np.int64),
-            incidence_deg=np.full(n * k, 8.0),
-            azimuth_deg=np.full(n * k, 100.0),
-            health=np.ones(n * k),
-            images=(replace(Acquisition("base"), incidence_deg=8.0, azimuth_deg=100.0),),
-        ),
-        chip_file=np.zeros(n, dtype=np.int64),
-        chip_row=rows * k,
-        chip_files=("chips",),
-    )
+    base = replace(Acquisition("base"), incidence_deg=8.0, azimuth_deg=100.0)
+    views = views_of_points(len(lon_lat_h), gsds_m, 8.0, 100.0, images=(base,))
+    points = points_with(lon_lat_h, views, 0.3)
     return points, WideChips(lon_lat_h, gsds_m)
