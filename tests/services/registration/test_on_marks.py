@@ -10,8 +10,9 @@ from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage
 from amers.services.registration.on_marks import register_on_marks
 from amers.services.registration.on_points import Registration
-from amers.services.registration.scene_marks import SceneMarks
-from amers.services.types import UNKNOWN_FRAME, Array, Frame
+from amers.services.registration.scene_marks import SceneMarks, with_marks
+from amers.services.types import UNKNOWN_FRAME, Array, Frame, SurfaceHeights
+from tests.factories import control_points
 from tests.services.simulated import ring_of_geometries
 
 GEOMETRY = ring_of_geometries(1, shape=(600, 800))[0]
@@ -121,3 +122,22 @@ def test_marks_less_precise_than_pixels_are_as_good_as_they_state():
 def test_accuracy_on_the_earth_needs_the_frame_of_the_marks():
     registration = register_on_marks(SCENE, marks_at(eight(), frame=UNKNOWN_FRAME))
     assert np.isnan(registration.qualification.accuracy.on_the_earth.ce90_m)
+
+
+def test_marks_stand_behind_the_points_of_a_base_as_a_block_of_their_own():
+    """Two blocks of points, of which some have a surface; marks have none, and no views."""
+    base = control_points(5, np.random.default_rng(1))
+    surface = SurfaceHeights(np.arange(5.0), np.ones(5))
+    base = replace(base, block=np.array([0, 1, 0, 1, 1]), frames=2 * base.frames, surface=surface)
+    marks = marks_at(eight()[:3])
+    both = with_marks(base, marks)
+    assert both.block.tolist() == [0, 1, 0, 1, 1, 2, 2, 2]
+    assert both.frames == (*base.frames, FRAME)
+    assert both.id.tolist() == [0, 1, 2, 3, 4, -1, -2, -3]
+    np.testing.assert_array_equal(np.diff(both.views.start), [6] * 5 + [0] * 3)
+    np.testing.assert_array_equal(both.surface.height_m, [0, 1, 2, 3, 4] + [np.nan] * 3)
+    np.testing.assert_array_equal(both.lon_lat_h, np.concatenate([base.lon_lat_h, marks.lon_lat_h]))
+    np.testing.assert_allclose(both.covariance_m2[5:], [0.1**2 * np.eye(3)] * 3)
+    some = marks.take(np.array([2, 0]))
+    assert (some.names, some.numbers.tolist()) == (("GCP2", "GCP0"), [-3, -1])
+    np.testing.assert_array_equal(some.line_sample, marks.line_sample[[2, 0]])

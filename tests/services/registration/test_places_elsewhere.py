@@ -13,8 +13,9 @@ from amers.services.misfit.scene_adjustment import AdjustmentOptions
 from amers.services.quality.points_elsewhere import Elsewhere
 from amers.services.registration.context import PointContext
 from amers.services.registration.elsewhere import adjust_with_places
+from amers.services.registration.missed_points import search_missed_points
 from amers.services.registration.options import RegistrationOptions
-from amers.services.registration.search import Search, adjust_search, select_inliers
+from amers.services.registration.search import Search, adjust_search, predict, select_inliers
 from amers.services.types import (
     Acquisition,
     Array,
@@ -143,10 +144,12 @@ def test_few_tall_points_are_not_believed_where_the_others_do_not_move_with_thei
     assert named(displaced(above_m, above_m > 100.0), place, ground_m + above_m) is None
 
 
-def narrow_search(of: Scene, points: ControlPoints, chips: MemoryChips) -> tuple[PointContext, Search]:
-    """A search of points within six pixels of their chips."""
+def narrow_search(
+    of: Scene, points: ControlPoints, chips: MemoryChips, radius_px: int = 6
+) -> tuple[PointContext, Search]:
+    """A search of points within some pixels of their chips."""
     context = point_context(of, points, chips, GRID_M)
-    narrow = ChipSearch(of.image, of.model, of.acquisition, GRID_M, 6)
+    narrow = ChipSearch(of.image, of.model, of.acquisition, GRID_M, radius_px)
     matches = match_points(narrow, points, chips, context.options.matching)
     inliers, _ = select_inliers(of.model, points, matches)
     return context, Search(points, np.arange(len(points.id)), matches, inliers, CHIP_SIZE * GRID_M)
@@ -214,24 +217,52 @@ def test_only_points_that_were_not_found_are_searched_in_a_wide_window() -> None
     assert read.rows == set(lost.tolist())
 
 
-def test_lines_that_lie_far_from_the_others_are_found_in_a_wide_window() -> None:
-    """A scene of which the last lines lie 40 pixels aside, where a narrow search does not see them."""
-    axis = 312.0 + np.linspace(60.0, 340.0, 8)
+def with_lines_aside(aside_px: int, a_side: int) -> tuple[Scene, ControlPoints, MemoryChips]:
+    """A scene of which the last lines show the ground some pixels aside, and points all over it."""
+    axis = 312.0 + np.linspace(60.0, 340.0, a_side)
     points, chips = points_at(np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2))
-    points = replace(points, lon_lat_h=points.lon_lat_h + [[0.0, 0.0, k % 7] for k in range(64)])
+    relief = [[0.0, 0.0, k % 7] for k in range(len(points))]
     of = scene(np.zeros(2), 5.0)
     wide = scene(np.zeros(2), 5.0, 400, 520).image.read(Window(0, 0, 400, 520))
     pixels = of.image.read(Window(0, 0, 400, 400))
-    pixels[260:] = wide[260:, 100:500]
+    pixels[260:] = wide[260:, 60 + aside_px : 460 + aside_px]
     broken = replace(of, image=ArrayImage(pixels))
-    context, search = narrow_search(broken, points, chips)
+    return broken, replace(points, lon_lat_h=points.lon_lat_h + relief), chips
+
+
+@pytest.mark.parametrize(("aside_px", "radius_px"), [(40, 6), (5, 3)])
+def test_lines_that_lie_far_from_the_others_are_found_in_a_wide_window(
+    aside_px: int, radius_px: int
+) -> None:
+    """Where a narrow search does not see them, and no nearer than points scatter."""
+    broken, points, chips = with_lines_aside(aside_px, 8)
+    context, search = narrow_search(broken, points, chips, radius_px)
     elsewhere = elsewhere_of(context, search)
     assert elsewhere is not None
     beside = points.lon_lat_h[elsewhere.rows]
     line = broken.model.project(beside)[:, 0]
     assert len(line) >= 8
     assert line.min() > 260.0
-    np.testing.assert_allclose(elsewhere.displacement_px, [0.0, -40.0], atol=0.5)
-    assert elsewhere.displacement_m == pytest.approx(40.0 * GRID_M, rel=0.02)
+    np.testing.assert_allclose(elsewhere.displacement_px, [0.0, -aside_px], atol=0.5)
+    assert elsewhere.displacement_m == pytest.approx(aside_px * GRID_M, rel=0.02)
     assert elsewhere.false_alarms < 1e-5
     assert elsewhere.slope_px is None
+
+
+def test_missed_points_are_searched_farther_out_on_all_their_lines() -> None:
+    """Of 48 points in four rows no more than 40, as many of each row."""
+    broken, points, chips = with_lines_aside(40, 12)
+    context, search = narrow_search(broken, points, chips)
+    adjustment = adjust_search(broken, search, context.options.adjustment)
+    prediction = predict(broken, points, adjustment)
+    farther, again = search_missed_points(context, prediction, search, adjustment)
+    before, after = (one.matches.reason == "" for one in (search, farther))
+    row = np.arange(len(points)) // 12
+    added = np.bincount(row[after & ~before], minlength=12)
+    # Chips of the first of these rows show both places.
+    assert added[:9].sum() == 0
+    assert added[9:].min() >= 5
+    assert np.ptp(added[9:]) <= 1
+    assert len(again.active) == len(points)
+    moved_px = farther.matches.line_sample - prediction.model.project(points.lon_lat_h)
+    np.testing.assert_allclose(np.median(moved_px[after & ~before], axis=0), [0.0, -40.0], atol=1.0)

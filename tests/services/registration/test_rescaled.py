@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from amers.services.errors import NoConsensus, NotEnoughPoints, RescaledImage
-from amers.services.imagery.source import ArrayImage
+from amers.services.imagery.source import ArrayImage, Window
 from amers.services.registration.on_points import register_scene
 from amers.services.registration.options import RegistrationOptions
-from amers.services.registration.rescaled import how_it_is_rescaled, rescaled_scene
-from tests.services.registration.small_ground import many_points, resampled, whole
+from amers.services.registration.rescaled import _middle, how_it_is_rescaled, rescaled_scene
+from tests.services.registration.small_ground import many_points, resampled, scene, whole
 
 
 @pytest.mark.parametrize(
@@ -60,3 +60,18 @@ def test_a_registration_is_refused_before_more_points_are_searched_or_the_image_
         register_scene(resampled(2.0, sigma_m), *many_points())
     assert isinstance(refused.value, NoConsensus)
     assert not isinstance(refused.value, NotEnoughPoints)
+
+
+@pytest.mark.parametrize("side", [200, 2000])
+def test_the_middle_of_an_image_is_where_its_model_shows_it(side: int) -> None:
+    """Of 400 lines and 500 samples; a smaller image is its own middle."""
+    of = scene(np.zeros(2), 5.0, 400, 500)
+    middle = _middle(of, side)
+    lines, samples = middle.image.shape
+    assert (lines, samples) == ((200, 200) if side == 200 else (400, 500))
+    first = (400 - lines) // 2, (500 - samples) // 2
+    at = np.array([[199.5, 249.5], [150.0, 260.0]])
+    ground = of.model.locate(at, np.zeros(2))
+    np.testing.assert_allclose(middle.model.project(ground), at - first, atol=1e-6)
+    shown, expected = middle.image.read(Window(0, 0, 90, 120)), of.image.read(Window(*first, 90, 120))
+    np.testing.assert_array_equal(shown, expected)

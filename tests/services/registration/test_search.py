@@ -17,6 +17,7 @@ from amers.services.registration.search import (
     check_inliers,
     first_consensus,
     predict,
+    select_inliers,
     summarise,
 )
 from amers.services.sensors.base import SensorModel
@@ -26,7 +27,8 @@ from amers.services.types import Acquisition, Array
 from tests.factories import control_points
 from tests.services.conftest import GSD_M as FLAT_GSD_M
 from tests.services.conftest import SHAPE, FlatModel, register
-from tests.services.registration.small_ground import matches_at
+from tests.services.registration.small_ground import context_of, matches_at
+from tests.services.registration.small_ground import scene as small_scene
 
 LINES, GSD_M = 5000, 20.0
 SHIFT_PX = np.array([180.0, -165.0])
@@ -247,6 +249,40 @@ def test_a_point_still_to_be_found_may_be_as_far_off_as_the_points_found() -> No
     expected_m2 = 4.0 * first_m**2 - 3.0 * (rms_px * FLAT_GSD_M) ** 2
     found_m2 = predict(scene, points, vague).uncertainty_m ** 2
     np.testing.assert_allclose(found_m2, expected_m2, rtol=0.01)
+    for shift in (0, 3):
+        # A point is as uncertain as in its worse coordinate.
+        covariance = np.zeros((6, 6))
+        covariance[shift, shift] = 2.0**2
+        of_one = predict(scene, points, replace(adjustment, covariance=covariance)).uncertainty_m
+        np.testing.assert_allclose(of_one, np.hypot(2.0, rms_px) * FLAT_GSD_M, rtol=0.01)
+
+
+@pytest.mark.parametrize("sigmas_m", [(2.0, 2.0), (0.0, 2.0 * np.sqrt(2.0)), (2.0 * np.sqrt(2.0), 0.0)])
+def test_points_agree_within_what_they_and_their_matches_are_off_by(
+    sigmas_m: tuple[float, float],
+) -> None:
+    """Four pixels of ground in the mean of both coordinates, and three of a match; no heights."""
+    place = np.random.default_rng(3).uniform(100.0, 3900.0, (30, 2))
+    covariance_m2 = np.tile(np.diag([*sigmas_m, 50.0]) ** 2, (30, 1, 1))
+    points = replace(
+        control_points(30, np.random.default_rng(2)),
+        lon_lat_h=FlatModel().locate(place, np.zeros(30)),
+        covariance_m2=covariance_m2,
+    )
+    inliers, tolerance_px = select_inliers(FlatModel(), points, matches_at(place, 0.0 * place, 3.0))
+    assert inliers.all()
+    assert tolerance_px == pytest.approx(0.5 + 3.0 * 5.0)
+
+
+def test_equal_parts_of_the_work_follow_one_another() -> None:
+    told: list[float] = []
+    context = replace(
+        context_of(small_scene(np.zeros(2), 5.0)), progress=lambda fraction, _: told.append(fraction)
+    )
+    for part in context.parts(0.2, 0.6, 3):
+        part.progress(0.0, "")
+        part.progress(1.0, "")
+    np.testing.assert_allclose(told, [0.2, 0.4, 0.4, 0.6, 0.6, 0.8])
 
 
 @pytest.mark.parametrize(("matched", "named"), [(0, True), (3, True), (5, True), (7, False)])

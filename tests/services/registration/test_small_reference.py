@@ -5,16 +5,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from amers.services.conventions import CHIP_SIZE
 from amers.services.errors import NoConsensus, RescaledImage
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage, Window
-from amers.services.matching.reference_image import Reference
+from amers.services.matching.reference_image import NO_HEIGHT_SIGMA_M, Reference
 from amers.services.registration.context import SearchStage
 from amers.services.registration.on_points import Registration
-from amers.services.registration.on_reference import register_on_reference
+from amers.services.registration.on_reference import (
+    _points_around,
+    _ReferenceContext,
+    register_on_reference,
+)
 from amers.services.registration.options import ReferenceOptions, RegistrationOptions
+from amers.services.registration.reference_points import reference_points
 from amers.services.sensors.ortho import OrthoModel
-from amers.services.types import Array
+from amers.services.types import Array, no_progress
 from tests.services.registration.small_ground import GRID, GSD_M, resampled, scene, whole
 
 OPTIONS = RegistrationOptions(reference=ReferenceOptions(places=100, leading_places=36))
@@ -161,3 +167,34 @@ def test_places_that_were_found_before_are_searched_again_where_they_lie() -> No
     assert (apart_deg[:5] < pixel_deg).all()
     assert (apart_deg[5:] > pixel_deg).all()
     assert 90 <= len(found) <= 105
+
+
+@pytest.mark.parametrize(("sigma_m", "factor"), [(10.5, 1), (10.9, 2)])
+def test_the_first_level_has_three_sigmas_within_sixteen_of_its_pixels(
+    sigma_m: float, factor: int
+) -> None:
+    first = stages_of(scene(np.array([7.0, -5.0]), sigma_m))[0]
+    assert first.chip_gsd_m == pytest.approx(factor * GSD_M, rel=0.01)
+
+
+@pytest.mark.parametrize("gsd_m", [GSD_M, 3.0 * GSD_M])
+def test_points_around_a_scene_have_their_chips_in_the_reference(gsd_m: float) -> None:
+    """As many pixels of the reference are left at its border as half a chip has, and hardly more."""
+    of = scene(np.zeros(2), 150.0)
+    context = _ReferenceContext(of, OPTIONS, no_progress, [], None, reference(), 1)
+    points, chips = _points_around(context, gsd_m)
+    at = whole().model.project(points.lon_lat_h)
+    left_px = np.minimum(at, 1023.0 - at).min()
+    half_px = CHIP_SIZE / 2.0 * gsd_m / GSD_M
+    assert half_px - 1.0 < left_px < half_px + 60.0
+    assert np.isclose(points.views.gsd_m, gsd_m).all()
+    assert (chips.read("reference", 3, 1) > 0).mean() > 0.95
+
+
+def test_places_are_as_precise_as_the_reference_and_as_high_as_its_terrain_says() -> None:
+    ground = whole().model.locate(np.array([[300.0, 300.0], [500.0, 600.0]]), np.zeros(2))
+    points = reference_points(ground, reference())
+    expected = np.diag([0.3**2, 0.3**2, NO_HEIGHT_SIGMA_M**2])
+    np.testing.assert_allclose(points.covariance_m2, [expected] * 2)
+    np.testing.assert_allclose(points.views.gsd_m, GSD_M, rtol=1e-3)
+    assert points.frames == (reference().frame,)
