@@ -10,7 +10,7 @@ from amers.services.errors import InputError
 from amers.services.imagery.source import render_chip
 from amers.services.sensors.correction import CorrectedModel
 from amers.services.simulation.land import NO_ROOF
-from amers.services.simulation.light import radiance_of_day, smooth_radiance
+from amers.services.simulation.light import SKY_LIGHT, radiance_of_day, smooth_radiance
 from amers.services.simulation.render import Radiometry, ray_setup, render
 from amers.services.simulation.view import (
     SimulatedView,
@@ -249,6 +249,27 @@ def test_shadows_fall_away_from_the_sun(world: World) -> None:
     n = len(radiance)
     assert radiance[n // 2 - 20 - 40, n // 2] < 0.5 * radiance[n // 2 + 20 + 40, n // 2]
     assert radiance[n // 2 - 20 - 70, n // 2] == radiance[n // 2 + 20 + 40, n // 2]
+
+
+@pytest.mark.parametrize("towards", [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
+def test_slopes_reflect_what_falls_on_them(world: World, towards: tuple[float, float]) -> None:
+    """In proportion to the cosine between sun and normal, beside the light of the sky."""
+    small = np.s_[:60, :60]
+    east, north = np.meshgrid(np.arange(60.0), -np.arange(60.0))
+    rise = 0.3 * world.posting_m * (towards[0] * east + towards[1] * north)
+    bare = replace(
+        world,
+        terrain_m=(200.0 + rise).astype(np.float32),
+        roof_m=np.full((60, 60), NO_ROOF, dtype=np.float32),
+        albedo=np.full((60, 60), 0.5, dtype=np.float32),
+        parcel=np.zeros_like(world.parcel[small]),
+    )
+    light = radiance_of_day(bare, SUMMER.date(), 40.0, 200.0)[10:-10, 10:-10]
+    elevation, azimuth = np.radians([40.0, 200.0])
+    sun = np.array([np.sin(azimuth), np.cos(azimuth), np.tan(elevation)]) * np.cos(elevation)
+    normal = np.cross([1.0, 0.0, 0.3 * towards[0]], [0.0, 1.0, 0.3 * towards[1]])
+    share = sun @ normal / np.linalg.norm(normal) / sun[2]
+    np.testing.assert_allclose(light, 0.5 * (SKY_LIGHT + (1.0 - SKY_LIGHT) * share), rtol=1e-3)
 
 
 def test_terrain_that_would_occlude_itself_is_refused(world: World) -> None:
