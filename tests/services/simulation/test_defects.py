@@ -93,6 +93,17 @@ def test_a_part_of_the_detectors_shows_what_lies_beside(world: World, taken: Vie
     np.testing.assert_array_equal(detectors.seen(places, 330) - places, steps[[0, 1, 1]])
 
 
+@pytest.mark.parametrize("parts", [1, 2, 3, 6])
+def test_parts_of_the_detectors_follow_one_another_over_the_image(parts: int) -> None:
+    """Six tiles, the last of 10 samples; what lies beyond the image belongs to its first and last."""
+    steps = np.arange(2.0 * parts).reshape(parts, 2)
+    sample = np.array([-100.0, 0.0, 63.4, 63.6, 150.0, 200.0, 260.0, 319.4, 319.6, 329.0, 500.0])
+    tile = np.array([0, 0, 0, 1, 2, 3, 4, 4, 5, 5, 5])
+    places = np.column_stack([np.full(len(sample), 7.0), sample])
+    moved = Detectors(steps).seen(places, 330) - places
+    np.testing.assert_allclose(moved, steps[tile // (6 // parts)], atol=1e-9)
+
+
 def test_a_blur_is_that_of_the_whole_image_and_has_no_tiles(world: World, taken: ViewGeometry) -> None:
     window = Window(0, 0, 300, 330)
     perfect = TiledView(world, taken, 1).read(window)
