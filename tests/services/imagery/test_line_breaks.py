@@ -1,6 +1,5 @@
 """Lost and repeated lines are seen in the pixels, at their lines, and nothing else is taken for them."""
 
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -11,6 +10,7 @@ from amers.services.formats.images.scenes import read_scene
 from amers.services.imagery.line_breaks import line_breaks
 from amers.services.imagery.source import ArrayImage, Window
 from amers.services.types import FloatImage
+from tests.services.imagery.textures import Watched
 
 LINES, SAMPLES = 900, 700
 REAL_VIEWS = (
@@ -143,17 +143,6 @@ def test_an_image_of_one_value_or_of_few_lines_has_no_breaks() -> None:
     assert not found(np.full((300, 300), np.nan, dtype=np.float32))
     assert not found(ground(6, (10, 300)))
     assert not found(ground(6, (300, 5)))
-
-
-@dataclass(frozen=True)
-class Watched(ArrayImage):
-    """An image that remembers the windows that are read."""
-
-    windows: list[Window] = field(default_factory=list)
-
-    def read(self, window: Window) -> FloatImage:
-        self.windows.append(window)
-        return super().read(window)
 
 
 @pytest.mark.thorough

@@ -1,7 +1,6 @@
 """What is wrong with pixels is named with its place and size; ground, files and weather are not."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from itertools import cycle
 
 import cv2
@@ -16,11 +15,12 @@ from amers.services.imagery.pixel_checks import (
     pixel_findings,
     pixel_statistics,
 )
-from amers.services.imagery.source import ArrayImage, Window
+from amers.services.imagery.source import ArrayImage
 from amers.services.types import FloatImage
 from tests.services.imagery.textures import (
     SHAPE,
     TEXTURES,
+    Watched,
     changed,
     compressed,
     hazy,
@@ -243,17 +243,6 @@ def test_blur_and_compression_are_numbers() -> None:
     coarse = pixel_findings(ArrayImage(compressed(pixels, 40)))
     assert np.sqrt(soft.blur_px**2 - sharp.blur_px**2) == pytest.approx(1.5, rel=0.1)
     assert sharp.blocking < 0.1 < coarse.blocking
-
-
-@dataclass(frozen=True)
-class Watched(ArrayImage):
-    """An image that remembers the windows that are read."""
-
-    windows: list[Window] = field(default_factory=list)
-
-    def read(self, window: Window) -> FloatImage:
-        self.windows.append(window)
-        return super().read(window)
 
 
 @pytest.mark.thorough

@@ -1,8 +1,11 @@
 """Pixels of ground with several power spectra, and what goes wrong with them."""
 
+from dataclasses import dataclass, field
+
 import cv2
 import numpy as np
 
+from amers.services.imagery.source import ArrayImage, Window
 from amers.services.types import FloatImage
 
 SHAPE = (640, 560)
@@ -127,3 +130,14 @@ def compressed(pixels: FloatImage, quality: int) -> FloatImage:
         ".jpg", rounded(pixels, "uint8").astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality]
     )
     return np.asarray(cv2.imdecode(coded[1], cv2.IMREAD_GRAYSCALE), np.float32)
+
+
+@dataclass(frozen=True)
+class Watched(ArrayImage):
+    """An image that remembers the windows that are read."""
+
+    windows: list[Window] = field(default_factory=list)
+
+    def read(self, window: Window) -> FloatImage:
+        self.windows.append(window)
+        return super().read(window)

@@ -75,6 +75,19 @@ def observed(truth: JointTruth, rng: np.random.Generator) -> tuple[list[Measured
     return scenes, tie_points(truth.images, places(rng, origin(), EXTENT_M, 900, 60.0), rng)
 
 
+def ortho_truth(
+    like: SceneTruth, middle: Array, side: int, gsd_m: float, shift_px: tuple[float, float]
+) -> SceneTruth:
+    """An ortho-image around a place, off by a shift, a drift and a skew."""
+    centre = MapGrid("EPSG:32631", np.zeros(2), np.eye(2), (2, 2)).line_sample(middle[None, :2])[0]
+    step = gsd_m * np.array([[0.0, 1.0], [-1.0, 0.0]])
+    grid = MapGrid("EPSG:32631", centre - step @ np.full(2, (side - 1) / 2.0), step, (side, side))
+    plan = replace(like.plan, name="ortho", shape=(side, side), gsd_m=gsd_m)
+    parameters = np.column_stack([shift_px, [[0.4, -0.3], [0.2, 0.5]]])
+    geometry = replace(like.geometry, rpc=OrthoModel(grid))  # type: ignore[arg-type]
+    return SceneTruth(plan, geometry, replace(no_correction(plan.shape), parameters=parameters))
+
+
 def adjusted(seed: int | list[int], **last: object) -> tuple[JointTruth, JointBlock]:
     """A block of which all scenes fit."""
     rng = np.random.default_rng(seed)
@@ -267,15 +280,8 @@ def test_an_ortho_image_joins_images_with_rpcs() -> None:
     """It tells positions, no heights, and is held by its own points and by ties like the others."""
     rng = np.random.default_rng(9)
     truth = truth_of(rng)
-    lon, lat = origin()[:2]
-    centre = MapGrid("EPSG:32631", np.zeros(2), np.eye(2), (2, 2)).line_sample(np.array([[lon, lat]]))[0]
-    step = np.array([[0.0, 1.0], [-1.0, 0.0]])
-    grid = MapGrid("EPSG:32631", centre - step @ np.full(2, 1999.5), step, (4000, 4000))
-    plan = replace(truth.images[2].plan, shape=(4000, 4000), gsd_m=1.0)
-    zero = no_correction(plan.shape)
-    error = replace(zero, parameters=np.array([[7.0, 0.4, -0.3], [-5.0, 0.2, 0.5]]))
-    geometry = replace(truth.images[2].geometry, rpc=OrthoModel(grid))  # type: ignore[arg-type]
-    images = (*truth.images[:2], SceneTruth(plan, geometry, error))
+    ortho = ortho_truth(truth.images[2], origin(), 4000, 1.0, (7.0, -5.0))
+    images = (*truth.images[:2], ortho)
     truth = replace(truth, images=images)
     scenes, ties = observed(truth, rng)
     block, left = adjust_fitting(scenes, ties, OPTIONS)

@@ -15,16 +15,13 @@ from amers.services.joint.measured import MeasuredScene, nothing_found
 from amers.services.joint.nearest import nearest_correction, scene_heights_m
 from amers.services.joint.registration import qualified
 from amers.services.joint.results import rigorous_scene, scene_adjustment
-from amers.services.map_grid import MapGrid
 from amers.services.quality.stability import image_places
 from amers.services.registration.options import RegistrationOptions
-from amers.services.sensors.correction import CorrectedModel, no_correction
-from amers.services.sensors.ortho import OrthoModel
+from amers.services.sensors.correction import CorrectedModel
 from amers.services.sensors.parameter_sets import SRP, TOUTIN, ParameterSet
 from amers.services.sensors.pushbroom import PushbroomModel
 from amers.services.sensors.refined import refined_rpc
 from amers.services.sensors.rpc_fit import fit_rpc
-from amers.services.simulation.world import World, make_world
 from amers.services.types import Array, Frame, Observations
 from benchmarks._joint_scenes import (
     ImagePlan,
@@ -37,6 +34,7 @@ from benchmarks._joint_scenes import (
     places,
     tie_points,
 )
+from tests.services.joint.test_joint_block import ortho_truth, world
 from tests.services.ties import whitened_square
 
 pytestmark = pytest.mark.thorough
@@ -78,11 +76,6 @@ class BrokenTruth(RigorousTruth):
 
 
 @cache
-def world() -> World:
-    return make_world(np.random.default_rng(1), size_m=1000.0, posting_m=2.0)
-
-
-@cache
 def origin() -> Array:
     return np.append(world().centre_lon_lat, 600.0)
 
@@ -110,25 +103,13 @@ def plan_of(number: int, **other: object) -> ImagePlan:
     return replace(plan, **other)  # type: ignore[arg-type]
 
 
-def ortho_truth(like: SceneTruth) -> SceneTruth:
-    """An ortho-image of 3 m of the middle of the block, off by a shift, a drift and a skew."""
-    lon_lat = origin()[None, :2]
-    centre = MapGrid("EPSG:32631", np.zeros(2), np.eye(2), (2, 2)).line_sample(lon_lat)[0]
-    step, side = np.array([[0.0, 3.0], [-3.0, 0.0]]), 8000
-    grid = MapGrid("EPSG:32631", centre - step @ np.full(2, (side - 1) / 2.0), step, (side, side))
-    plan = replace(like.plan, name="ortho", shape=(side, side), gsd_m=3.0)
-    zero = no_correction(plan.shape)
-    error = replace(zero, parameters=np.array([[2.5, 0.4, -0.3], [-1.5, 0.2, 0.5]]))
-    geometry = replace(like.geometry, rpc=OrthoModel(grid))  # type: ignore[arg-type]
-    return SceneTruth(plan, geometry, error)
-
-
 def mixed(rng: np.random.Generator, free: ParameterSet = SRP, points: int = 80) -> JointTruth:
     """Two images with rigorous models, one with an RPC, and an ortho-image."""
     rigorous = [rigorous_truth(plan_of(number), free, rng) for number in (0, 1)]
     rpc = rpc_truth(plan_of(2), rng)
     ground = places(rng, origin(), EXTENT_M, points, RELIEF_M)
-    return joint_truth([*rigorous, rpc, ortho_truth(rpc)], ground, rng, frame=FRAME)
+    ortho = ortho_truth(rpc, origin(), 8000, 3.0, (2.5, -1.5))
+    return joint_truth([*rigorous, rpc, ortho], ground, rng, frame=FRAME)
 
 
 def observed(truth: JointTruth, rng: np.random.Generator) -> tuple[list[MeasuredScene], Observations]:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -10,7 +11,7 @@ from amers.services.errors import NoConsensus
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage, Window
 from amers.services.registration.context import Prediction, RegistrationContext, SearchStage
-from amers.services.registration.far import search_far
+from amers.services.registration.far import _contrast, _standardised, search_far
 from amers.services.types import Array
 from tests.services.registration.small_ground import (
     GSD_M,
@@ -133,3 +134,20 @@ def test_of_a_scene_that_is_too_large_for_the_map_the_middle_is_searched(
     prediction, stage = found(of, max_reduction=1)
     assert stage.middle_m == 301 * GSD_M
     assert error_px(prediction, of, np.array([40.0, -60.0])) < 0.3
+
+
+def test_chips_with_lost_pixels_are_searched_as_well() -> None:
+    """Three of each on average, as impulses leave them."""
+    of, (points, chips) = scene(OFF_M, SIGMA_M), many_points()
+    pitted = chips.chips.copy()
+    pitted[np.random.default_rng(2).random(pitted.shape) < 300e-6] = 0
+    prediction = search_far(context_of(of), points, MemoryChips(pitted), predicted(of, points), GSD_M)
+    assert error_px(prediction, of, OFF_M) < 0.3
+
+
+def test_contrast_makes_covariances_normalised_correlations() -> None:
+    rng = np.random.default_rng(17)
+    pixels = (100.0 + 20.0 * rng.normal(size=(60, 60))).astype(np.float32)
+    chip = rng.normal(size=(11, 11)).astype(np.float32)
+    found = cv2.matchTemplate(pixels, _standardised(chip), cv2.TM_CCORR) / _contrast(pixels, 11)
+    np.testing.assert_allclose(found, cv2.matchTemplate(pixels, chip, cv2.TM_CCOEFF_NORMED), atol=1e-4)

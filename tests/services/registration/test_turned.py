@@ -24,6 +24,7 @@ DELIVERED = np.arange(LINES * SAMPLES, dtype=np.float32).reshape(LINES, SAMPLES)
 """The image that belongs to the model: no two pixels are alike."""
 AT = np.stack(np.meshgrid(np.arange(LINES), np.arange(SAMPLES), indexing="ij"), -1).reshape(-1, 2)
 BLANK = Scene(ArrayImage(DELIVERED), FlatModel(), Acquisition("blank"), 1.0)
+POINTS = control_points(3, np.random.default_rng(0)), MemoryChips(np.zeros((9, 101, 101)))
 GROUND = FlatModel().locate(AT.astype(np.float64), np.zeros(len(AT)))
 
 
@@ -79,8 +80,7 @@ def test_an_image_is_turned_as_the_first_model_says_that_half_of_the_points_agre
         return None, SimpleNamespace(matches=matches), SimpleNamespace(active=active)
 
     monkeypatch.setattr("amers.services.registration.on_points.search_scene", search)
-    points, chips = control_points(3, np.random.default_rng(0)), MemoryChips(np.zeros((9, 101, 101)))
-    said = _how_it_is_turned(BLANK, points, chips, RegistrationOptions())
+    said = _how_it_is_turned(BLANK, *POINTS, RegistrationOptions())
     assert (said != "") == is_turned
     assert len(searched) == (3 if is_turned else len(WAYS))
     if is_turned:
@@ -105,8 +105,7 @@ def test_turned_models_are_searched_once_with_few_points_of_few_views(
         matching=MatchingOptions(max_views=views, agreement_px=0.6),
         seed=3,
     )
-    none = control_points(3, np.random.default_rng(0)), MemoryChips(np.zeros((9, 101, 101)))
-    assert _how_it_is_turned(BLANK, *none, options) == ""
+    assert _how_it_is_turned(BLANK, *POINTS, options) == ""
     few = replace(
         options,
         max_points=60,

@@ -127,15 +127,6 @@ def test_repeated_lines_repeat_their_pixels_and_lost_ones_are_nowhere() -> None:
     assert not distortion.is_unique(repeated + [12.0, 0.0]).any()
 
 
-def test_repeated_lines_repeat_what_a_rendered_image_shows(
-    world: World, taken: ViewGeometry, straight: FloatImage
-) -> None:
-    pixels = TiledView(world, taken, 1, distortion=DISTORTIONS["steps"]).read(WHOLE)
-    assert np.abs(pixels[90:102] - pixels[78:90]).max() <= rounding
-    assert np.abs(pixels[102:200] - straight[102:200]).max() <= rounding
-    assert np.abs(pixels[200:270] - straight[230:300]).max() <= rounding
-
-
 @pytest.mark.parametrize("name", ["mirrored", "upside down", "swapped"])
 def test_turned_images_show_the_same_pixels_elsewhere(
     world: World, taken: ViewGeometry, straight: FloatImage, name: str
@@ -152,7 +143,7 @@ def test_turned_images_show_the_same_pixels_elsewhere(
     assert np.corrcoef(both[0].ravel(), both[1].ravel())[0, 1] > 0.99
 
 
-@pytest.mark.parametrize("name", ["jitter", "bow", "moved", "mixture"])
+@pytest.mark.parametrize("name", ["jitter", "bow", "steps", "moved", "seams", "mixture"])
 def test_rendered_pixels_are_where_the_distortion_says(
     world: World, taken: ViewGeometry, straight: FloatImage, name: str
 ) -> None:
@@ -161,7 +152,7 @@ def test_rendered_pixels_are_where_the_distortion_says(
     rendered = TiledView(world, taken, 1, distortion=distortion).read(WHOLE)
     resampled = DistortedImage(ArrayImage(straight), distortion).read(WHOLE)
     inside = np.isfinite(resampled)
-    assert inside.mean() > 0.9
+    assert inside.mean() > (0.88 if name == "steps" else 0.9)
     error = (rendered - resampled)[inside]
     untouched = (straight - resampled)[inside]
     assert error.std() < 0.35 * untouched.std()
