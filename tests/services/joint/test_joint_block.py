@@ -407,3 +407,22 @@ def test_a_scene_fits_by_its_ties_and_by_its_control_where_either_are_enough() -
     assert SceneFit(ties=100, used_ties=20, control=10, used_control=9, normalised=1.0).used == 0.2
     assert SceneFit(ties=100, used_ties=90, control=3, used_control=0, normalised=1.0).used == 0.9
     assert SceneFit(ties=3, used_ties=3, control=3, used_control=3, normalised=1.0).used == 0.0
+
+
+@pytest.mark.parametrize(
+    ("ties", "control", "stays"), [(11, 0, False), (12, 0, True), (2, 1, False), (2, 2, True)]
+)
+def test_a_scene_is_placed_by_twelve_ties_or_by_four_with_control(
+    ties: int, control: int, stays: bool
+) -> None:
+    rng = np.random.default_rng(23)
+    scenes, every = observed(truth_of(rng), rng)
+    search = scenes[2].search
+    inliers = search.inliers & (np.cumsum(scenes[2].usable) <= control)
+    scenes[2] = replace(scenes[2], search=replace(search, inliers=inliers), alone=None)
+    own = ties_between(every, [0, 1, 2])
+    few = own.take((own.image != 2) | (np.cumsum(own.image == 2) <= ties))
+    _, left = adjust_fitting(scenes, few, OPTIONS)
+    told = [str(one.error) for one in left if one.measured.name == "image 3"]
+    too_few = f"image 3: {ties} tie points and {control} control points found"
+    assert any(one.startswith(too_few) for one in told) != stays

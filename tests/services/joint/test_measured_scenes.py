@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -47,3 +48,13 @@ def test_a_point_lies_where_its_line_was_and_not_where_its_chip_was_on_average()
     assert inside.sum() > 20
     np.testing.assert_allclose(taken_back, lost * of_line, atol=0.1)
     assert np.abs(taken_back).max() > 0.5
+
+
+def test_points_on_ground_that_moved_are_not_used() -> None:
+    measured = still()
+    assert measured.alone is not None
+    moved = np.arange(len(measured.usable)) % 5 == 0
+    alone = replace(measured.alone, moved=SimpleNamespace(measures=moved))  # type: ignore[arg-type]
+    usable = replace(measured, alone=alone).usable
+    np.testing.assert_array_equal(usable, measured.usable & ~moved)
+    assert (measured.usable & moved).sum() > 3

@@ -1,14 +1,18 @@
 """The first search of few points far out: what it corrects, and when it is refused."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from amers.services.errors import NoConsensus
 from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ReducedImage
+from amers.services.matching.consensus import Consensus
 from amers.services.registration.coarse import _image_for, search_coarsely
 from amers.services.registration.context import Prediction, SearchStage
 from amers.services.registration.on_reference import _image_at
+from amers.services.registration.search import first_consensus
 from amers.services.types import Array
 from tests.services.registration.small_ground import (
     SIDE_PX,
@@ -63,6 +67,26 @@ def test_points_whose_chips_show_the_same_ground_are_too_few_to_be_believed() ->
         (group,) = stage.candidates
         assert group.points == 9
         np.testing.assert_allclose([group.east_m, group.north_m], OFF_M, atol=GSD_M)
+
+
+def test_two_tries_are_two_chances(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first is believed at half of the false alarms that are accepted; else the second is made."""
+    told: list[float] = []
+
+    def recorded(*of: Any, **how: Any) -> Consensus:
+        consensus = first_consensus(*of, **how)
+        told.append(consensus.false_alarms)
+        return consensus
+
+    monkeypatch.setattr("amers.services.registration.coarse.first_consensus", recorded)
+    of, (points, chips) = scene(OFF_M, SIGMA_M, 700, 700), points_at(lattice(3, 30.0), GSD_M)
+    with pytest.raises(NoConsensus):
+        search_coarsely(point_context(of, points, chips, GSD_M, enough=1), predicted(of, points))
+    for times, tries in ((2.1, 1), (1.9, 2)):
+        accepted = {"enough": 1, "max_false_alarms": times * told[0]}
+        context = point_context(of, points, chips, GSD_M, **accepted)
+        search_coarsely(context, predicted(of, points))
+        assert len(context.stages) == tries
 
 
 @pytest.mark.parametrize("shape", [(1000, 900), (900, 1000)])

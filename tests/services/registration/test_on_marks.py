@@ -110,6 +110,9 @@ def test_a_few_marks_are_usable_with_the_accuracy_that_they_have(count):
     registration = register_on_marks(SCENE, marks_at(eight()[:count]))
     assert registration.qualification.verdict == "usable"
     assert "drift and skew" in words(registration)
+    names = {one.name for one in registration.qualification.criteria}
+    repeated = {"displacement_px", "residual_std_px"}
+    assert repeated & names == (repeated if count >= 3 else set())
     assert ("A single mark is used, and nothing checks it" in words(registration)) == (count == 1)
 
 
