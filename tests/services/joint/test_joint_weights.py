@@ -9,6 +9,7 @@ import pytest
 from amers.services.joint.block import JointBlock, adjust_together
 from amers.services.joint.fitting import scene_fit
 from amers.services.joint.measured import MeasuredScene
+from amers.services.joint.model_errors import _variance
 from amers.services.joint.registration import _uncertainty_m
 from amers.services.joint.results import ground_misfits_m, tie_residual_px
 from amers.services.quality.stability import image_places
@@ -131,8 +132,7 @@ def test_control_of_four_times_the_variance_places_a_scene_as_much_worse() -> No
         block = adjust_together([own], no_ties(), OPTIONS)
         at = image_places(SHAPE)
         ground = block.model(0).locate(at, np.full(len(at), 150.0))
-        design = block.images[0].computed(block.values(0), ground).by_parameters
-        variance.append(np.einsum("nck,kl,ncl->nc", design, block.covariance(0), design))
+        variance.append(_variance(block, 0, ground))
     # Drifts and skews are known to a pixel beforehand, which does not change.
     ratio = variance[1] / variance[0]
     assert 2.5 < ratio.min() < ratio.max() < 4.4

@@ -12,6 +12,7 @@ from amers.services.imagery.scene import Scene
 from amers.services.joint.block import JointBlock, adjust_together
 from amers.services.joint.fitting import adjust_fitting, ties_between
 from amers.services.joint.measured import MeasuredScene, nothing_found
+from amers.services.joint.model_errors import _variance
 from amers.services.joint.nearest import nearest_correction, scene_heights_m
 from amers.services.joint.registration import qualified
 from amers.services.joint.results import rigorous_scene, scene_adjustment
@@ -222,8 +223,7 @@ def test_the_nearest_correction_states_what_it_misses() -> None:
     )
     largest_px = np.hypot(*off_px.T).max()
     assert 0.5 * nearest.max_error_px < largest_px < 1.05 * nearest.max_error_px
-    design = block.images[0].computed(block.values(0), ground).by_parameters
-    exact = np.einsum("nck,kl,ncl->nc", design, block.covariance(0), design)
+    exact = _variance(block, 0, ground)
     affine = nearest.correction.covariance_at(at, nearest.covariance, nearest.local_px)
     ratio = np.diagonal(affine, 0, 1, 2).mean(axis=0) / exact.mean(axis=0)
     np.testing.assert_allclose(ratio, 1.0, rtol=0.05)
@@ -345,8 +345,7 @@ def test_what_no_affine_correction_states_of_a_rigorous_model_is_in_its_accuracy
     block = adjust_together([measured], tie_points(truth.images, truth.true_lon_lat_h, rng), OPTIONS)
     at = rng.uniform(0.0, SHAPE[0], (2000, 2))
     ground = block.images[0].model.locate(at, rng.choice(scene_heights_m(block, 0), 2000))
-    design = block.images[0].computed(block.values(0), ground).by_parameters
-    exact = np.einsum("nck,kl,ncl->nc", design, block.covariance(0), design).mean(axis=0)
+    exact = _variance(block, 0, ground).mean(axis=0)
     local_px2 = nearest_correction(block, 0).local_px ** 2
     assert local_px2[0] > 0.08 * exact[0]
     adjustment = scene_adjustment(block, 0, OPTIONS)

@@ -10,6 +10,7 @@ from amers.services.imagery.scene import Scene, scene_gsd_m
 from amers.services.imagery.source import ArrayImage
 from amers.services.matching.ground_features import FeatureOptions, Features, find_features
 from amers.services.matching.tie_points import match_features
+from amers.services.registration.turned import turned_scenes
 from amers.services.simulation.view import SimulatedView, ViewPlan, simulate_view
 from tests.services.simulated import BLOCK_SIGMA_M, block_views, world
 
@@ -31,31 +32,10 @@ def coarse_view() -> SimulatedView:
 def turned(scene: Scene) -> Scene:
     """The same image turned by a quarter: its lines are the samples, from the last to the first."""
     pixels = scene.image.pixels  # type: ignore[attr-defined]
-    return replace(scene, image=ArrayImage(np.ascontiguousarray(np.rot90(pixels))), model=Turned(scene))
-
-
-class Turned:
-    """The model of an image turned by `numpy.rot90`."""
-
-    def __init__(self, scene: Scene) -> None:
-        self._model, self._samples = scene.model, scene.image.shape[1]
-        self.height_range_m = scene.model.height_range_m
-
-    def project(self, lon_lat_h: np.ndarray) -> np.ndarray:
-        line, sample = self._model.project(lon_lat_h).T
-        return np.column_stack([self._samples - 1.0 - sample, line])
-
-    def locate(self, line_sample: np.ndarray, height_m: np.ndarray) -> np.ndarray:
-        line, sample = line_sample.T
-        return self._model.locate(np.column_stack([sample, self._samples - 1.0 - line]), height_m)
-
-    def project_derivative(self, lon_lat_h: np.ndarray) -> np.ndarray:
-        by_ground = self._model.project_derivative(lon_lat_h)
-        return np.stack([-by_ground[:, 1], by_ground[:, 0]], axis=1)
-
-    def line_of_sight(self, line_sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        line, sample = line_sample.T
-        return self._model.line_of_sight(np.column_stack([sample, self._samples - 1.0 - line]))
+    image = ArrayImage(np.ascontiguousarray(np.rot90(pixels)))
+    ways = dict(turned_scenes(replace(scene, image=image)))
+    (words,) = (one for one in ways if one.startswith("turned by 90 degrees: its samples"))
+    return ways[words]
 
 
 def matched_errors_px(one: Scene, other: Scene, truth: tuple, gsd_m: float) -> np.ndarray:

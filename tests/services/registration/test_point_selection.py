@@ -68,17 +68,12 @@ def prediction_within(sigma_m: float, scene: Scene, points: ControlPoints) -> Pr
     return Prediction(model, np.full(len(points), sigma_m))
 
 
-def tried(scene: Scene, points: ControlPoints, sigma_m: float) -> ControlPoints:
-    rows = points_to_try(scene, points, prediction_within(sigma_m, scene, points), FEW)
-    assert (np.diff(rows) > 0).all()
-    return points.take(rows)
-
-
 def test_an_accurate_scene_is_tried_on_points_that_it_shows() -> None:
     scene, points = small_scene(), points_around()
-    chosen = tried(scene, points, 0.5)
-    assert len(chosen) == FEW
-    assert enough_shown(scene, scene.model.project(chosen.lon_lat_h)).all()
+    rows = points_to_try(scene, points, prediction_within(0.5, scene, points), FEW)
+    assert len(rows) == FEW
+    assert (np.diff(rows) > 0).all()
+    assert enough_shown(scene, scene.model.project(points.lon_lat_h[rows])).all()
 
 
 def test_the_better_the_model_the_more_of_the_points_tried_are_shown() -> None:

@@ -62,42 +62,23 @@ def test_each_way_of_turning_is_undone_by_the_model_that_is_named_after_it(way: 
 
 
 @pytest.mark.parametrize(
-    ("found", "agree", "is_turned"), [(12, 12, True), (24, 12, True), (11, 11, False), (25, 12, False)]
+    ("found", "agree", "is_turned", "points", "views"),
+    [(12, 12, True, 60, 4), (24, 12, True, 60, 4), (11, 11, False, 10, 1), (25, 12, False, 60, 4)],
 )
 def test_an_image_is_turned_as_the_first_model_says_that_half_of_the_points_agree_on(
-    found: int, agree: int, is_turned: bool, monkeypatch: pytest.MonkeyPatch
+    found: int, agree: int, is_turned: bool, points: int, views: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A dozen at least. A model that finds nothing at all, as the first one here, is left aside."""
-    searched: list[tuple[Scene, RegistrationOptions]] = []
+    """A dozen at least, of a quick search. A model that finds nothing, as the first, is left aside."""
+    given: list[object] = []
 
-    def search(of: Scene, *given: object) -> tuple[object, object, object]:
-        searched.append((of, given[-1]))  # type: ignore[arg-type]
-        if len(searched) == 1:
+    def search(*of: object) -> tuple[object, object, object]:
+        given.append(of[-1])
+        if len(given) == 1:
             raise NotEnoughPoints(0, 6, "")
-        count = agree if len(searched) == 3 else 2
+        count = agree if len(given) == 3 else 2
         reason = np.where(np.arange(40) < found, "", "low_score")
         matches, active = SimpleNamespace(reason=reason), np.arange(40) < count
         return None, SimpleNamespace(matches=matches), SimpleNamespace(active=active)
-
-    monkeypatch.setattr("amers.services.registration.on_points.search_scene", search)
-    said = _how_it_is_turned(BLANK, *POINTS, RegistrationOptions())
-    assert (said != "") == is_turned
-    assert len(searched) == (3 if is_turned else len(WAYS))
-    if is_turned:
-        assert said.startswith("turned by 180 degrees")
-        assert f"by {agree} points that agree then" in said
-
-
-@pytest.mark.parametrize(("points", "views"), [(60, 4), (10, 1)])
-def test_turned_models_are_searched_once_with_few_points_of_few_views(
-    points: int, views: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With no more of them than is asked for, and everything else as it is."""
-    given: list[RegistrationOptions] = []
-
-    def search(*of: object) -> None:
-        given.append(of[-1])  # type: ignore[arg-type]
-        raise NotEnoughPoints(0, 6, "")
 
     monkeypatch.setattr("amers.services.registration.on_points.search_scene", search)
     options = RegistrationOptions(
@@ -105,7 +86,9 @@ def test_turned_models_are_searched_once_with_few_points_of_few_views(
         matching=MatchingOptions(max_views=views, agreement_px=0.6),
         seed=3,
     )
-    assert _how_it_is_turned(BLANK, *POINTS, options) == ""
+    said = _how_it_is_turned(BLANK, *POINTS, options)
+    assert said.startswith("turned by 180 degrees") == is_turned
+    assert (f"by {agree} points that agree then" in said) == is_turned
     few = replace(
         options,
         max_points=60,
@@ -113,4 +96,4 @@ def test_turned_models_are_searched_once_with_few_points_of_few_views(
         coarse=replace(options.coarse, points=min(points, 24)),
         matching=replace(options.matching, max_views=min(views, 2)),
     )
-    assert given == [few] * len(WAYS)
+    assert given == [few] * (3 if is_turned else len(WAYS))

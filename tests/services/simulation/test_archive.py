@@ -77,14 +77,6 @@ def test_errors_of_later_images_have_their_range_in_all_directions() -> None:
     np.testing.assert_allclose(np.abs(places_m(views)).max(axis=0), reach_m, rtol=0.05)
 
 
-def test_the_older_base_was_made_of_images_without_errors() -> None:
-    for view in older_views(SMALL, 1):
-        assert view.error_m == view.pass_error_m == view.stated_m == (0.0, 0.0)
-        assert not view.drift_px.any()
-        assert view.plan.lon_lat == CENTRE_LON_LAT
-        assert view.plan.shape[0] * view.plan.gsd_m == pytest.approx(SMALL.area_m + 800.0, abs=1.0)
-
-
 @pytest.mark.parametrize("views_of", [archive_views, later_views, older_views])
 def test_each_image_follows_from_the_seed_and_its_number(views_of) -> None:
     first, again, other = (views_of(SMALL, seed) for seed in (1, 1, 2))
