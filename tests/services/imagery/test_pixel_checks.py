@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from amers.services.imagery.jump_sizes import jump_px
-from amers.services.imagery.line_profiles import TransposedImage
+from amers.services.imagery.line_profiles import TransposedImage, line_profile
 from amers.services.imagery.pixel_checks import (
     Fault,
     PixelFinding,
@@ -94,6 +94,17 @@ def test_so_many_lines_are_lost_as_the_difference_of_others_tells(axis: int) -> 
             pixels = lost(ramp, first, count)
             image = ArrayImage(pixels) if axis == 0 else TransposedImage(ArrayImage(pixels.T))
             assert jump_px(image, first) == min(count, 32)
+
+
+def test_pixels_of_flat_blocks_differ_from_one_neighbour_at_most() -> None:
+    """In blocks of eight they tell that a line varies, and nothing of its detail."""
+    blocks = np.repeat(np.arange(20.0, dtype=np.float32), 8)[None] * np.ones((3, 1), np.float32)
+    ramp = np.arange(160.0, dtype=np.float32)[None] * np.ones((3, 1), np.float32)
+    for pixels, varying, detailed in ((blocks, 19, 0), (ramp, 159, 158)):
+        profile = line_profile(ArrayImage(pixels))
+        assert profile.varying.tolist() == [varying] * 3
+        assert profile.detailed.tolist() == [detailed] * 3
+        assert profile.equal.tolist() == [False, True, True]
 
 
 def test_lines_repeated_before_a_compression_are_named_as_repeated() -> None:

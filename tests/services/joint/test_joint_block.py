@@ -229,51 +229,45 @@ def test_every_scene_is_qualified_with_the_stability_of_the_block() -> None:
     assert held_cells(measures)
 
 
+def joining(seed: list[int], new: int, **last: object) -> tuple[float, float, JointBlock]:
+    """A scene joins the two others: how far it lies from one adjustment of all, and its accuracy.
+
+    Both as mean squares over what is stated.
+    """
+    rng = np.random.default_rng(seed)
+    truth = truth_of(rng, **last)  # type: ignore[arg-type]
+    scenes, ties = observed(truth, rng)
+    redone, _ = adjust_fitting(scenes, ties, OPTIONS)
+    old = [number for number in range(3) if number != new]
+    first, _ = adjust_fitting([scenes[k] for k in old], ties_between(ties, old), OPTIONS)
+    known = first.adjustment.known
+    assert known is not None
+    for k in old:
+        scenes[k] = nothing_found(scenes[k].scene, scenes[k].points.take(np.zeros(0, np.int64)))
+    joined, left = adjust_fitting(scenes, ties, OPTIONS, known)
+    assert not left
+    at = image_places(SHAPE)
+    one, other = (scene_adjustment(each, new, OPTIONS) for each in (joined, redone))
+    moved_px = one.correction.apply(at) - other.correction.apply(at)
+    apart = float(whitened_square(moved_px, one.covariance_at(at)).mean())
+    return apart, normalised(truth, joined, new)[0], joined
+
+
 @pytest.mark.thorough
 @pytest.mark.monte_carlo
 def test_a_scene_that_joins_agrees_with_one_adjustment_of_all_scenes() -> None:
-    squares, accurate = [], []
-    for trial in range(4):
-        rng = np.random.default_rng([10, trial])
-        truth = truth_of(rng)
-        scenes, ties = observed(truth, rng)
-        redone, _ = adjust_fitting(scenes, ties, OPTIONS)
-        first, _ = adjust_fitting(scenes[:2], ties_between(ties, [0, 1]), OPTIONS)
-        known = first.adjustment.known
-        assert known is not None
-        before = [nothing_found(one.scene, one.points.take(np.zeros(0, np.int64))) for one in scenes[:2]]
-        joined, left = adjust_fitting([*before, scenes[2]], ties, OPTIONS, known)
-        assert not left
-        at = image_places(SHAPE)
-        one, other = (scene_adjustment(each, 2, OPTIONS) for each in (joined, redone))
-        moved_px = one.correction.apply(at) - other.correction.apply(at)
-        stated = one.covariance_at(at)
-        squares.append(whitened_square(moved_px, stated).mean())
-        accurate.append(normalised(truth, joined, 2)[0])
-    assert np.mean(squares) < 0.5
+    apart, accurate, _ = zip(*(joining([10, trial], 2) for trial in range(4)), strict=True)
+    assert np.mean(apart) < 0.5
     assert 0.1 < np.mean(accurate) < 2.5
 
 
 @pytest.mark.thorough
 def test_a_scene_that_joins_an_oscillating_one_is_tied_to_what_that_scene_truly_shows() -> None:
-    squares = []
-    for trial in range(3):
-        rng = np.random.default_rng([12, trial])
-        truth = truth_of(rng, wave_px=(8.0, 5.0))
-        scenes, ties = observed(truth, rng)
-        redone, _ = adjust_fitting(scenes, ties, OPTIONS)
-        first, _ = adjust_fitting(scenes[1:], ties_between(ties, [1, 2]), OPTIONS)
-        known = first.adjustment.known
-        before = [nothing_found(one.scene, one.points.take(np.zeros(0, np.int64))) for one in scenes[1:]]
-        joined, left = adjust_fitting([scenes[0], *before], ties, OPTIONS, known)
-        assert not left
+    waves = {"wave_px": (8.0, 5.0)}
+    apart, _, blocks = zip(*(joining([12, trial], 0, **waves) for trial in range(3)), strict=True)
+    assert np.mean(apart) < 0.5
+    for joined in blocks:
         assert joined.adjustment.active[joined.of_ties(2)].mean() > 0.9
-        at = image_places(SHAPE)
-        one, other = (scene_adjustment(each, 0, OPTIONS) for each in (joined, redone))
-        moved_px = one.correction.apply(at) - other.correction.apply(at)
-        stated = one.covariance_at(at)
-        squares.append(whitened_square(moved_px, stated).mean())
-    assert np.mean(squares) < 0.5
 
 
 def test_an_ortho_image_joins_images_with_rpcs() -> None:

@@ -158,33 +158,8 @@ def test_a_scene_that_is_nearly_right_needs_no_coarse_search() -> None:
     assert [stage.name for stage in stages] == ["fine", "fine"]
 
 
-def test_the_same_scene_is_registered_the_same() -> None:
-    again = register_scene(view_of(FIRST).as_scene(SIGMA_M), *block())
-    first = registration(FIRST)
-    np.testing.assert_array_equal(
-        again.adjustment.correction.parameters, first.adjustment.correction.parameters
-    )
-    np.testing.assert_array_equal(again.measures.line_sample, first.measures.line_sample)
-    np.testing.assert_array_equal(again.measures.reason, first.measures.reason)
-    assert again.qualification.verdict == first.qualification.verdict
-
-
 def with_pixels(pixels: Array) -> Scene:
     return replace(view_of(FIRST).as_scene(SIGMA_M), image=ArrayImage(pixels.astype(np.float32)))
-
-
-def test_points_beyond_the_scene_are_left_aside() -> None:
-    points, chips = block()
-    rows = np.arange(2 * len(points)) % len(points)
-    doubled = replace(points.take(rows), id=np.arange(len(rows)))
-    doubled.lon_lat_h[len(points) :, 0] += 1.0
-    result = register_scene(view_of(FIRST).as_scene(SIGMA_M), doubled, chips)
-    assert result.measures.point_id.max() < len(points)
-    np.testing.assert_allclose(
-        result.adjustment.correction.parameters,
-        registration(FIRST).adjustment.correction.parameters,
-        atol=a_micropixel,
-    )
 
 
 def test_five_points_are_too_few() -> None:

@@ -72,6 +72,22 @@ def test_buildings_that_are_copied_stand_on_the_ground(world: World) -> None:
     assert later.roof_clearance_m < 60.0
 
 
+def test_what_is_copied_rises_as_high_above_the_ground_as_where_it_stood(world: World) -> None:
+    """Above the first cell of each rectangle, whose ground lies at another height."""
+    row, column = (int(v) - 10 for v in np.argwhere(world.roof_m > NO_ROOF).mean(axis=0))
+    source, place = np.s_[row : row + 200, column : column + 200], np.s_[20:220, 30:230]
+    before = copy_of(world)
+    change = Change(FIRST, (20, 30), (200, 200), (row, column))
+    later = apply_changes(copy_of(world), [change], FIRST)
+    dry = (before.parcel[place] != WATER) & (before.parcel[source] != WATER)
+    both = dry & (later.roof_m[place] > NO_ROOF)
+    assert both.sum() > 100
+    above = (later.roof_m[place] - before.terrain_m[place][0, 0])[both]
+    stood = (before.roof_m[source] - before.terrain_m[source][0, 0])[both]
+    np.testing.assert_allclose(above, stood, atol=1e-3)
+    assert abs(before.terrain_m[place][0, 0] - before.terrain_m[source][0, 0]) > 1.0
+
+
 def test_things_come_in_their_number_on_open_ground_only(world: World) -> None:
     before = copy_of(world)
     places = scatter_things(world, np.random.default_rng(5), 400.0)

@@ -99,6 +99,11 @@ def test_bends_are_as_large_as_stated_at_the_last_line() -> None:
     np.testing.assert_allclose(middle, [[-2.0, 1.0]], atol=1e-12)
 
 
+def test_a_kink_moves_what_lies_behind_it_by_its_rate() -> None:
+    places = np.array([[20.0, 7.0], [120.0, 200.0], [220.0, 7.0]])
+    np.testing.assert_allclose(KINK.at(places), [[0.0, 0.0], [0.0, 0.0], [1.0, -2.0]], atol=1e-12)
+
+
 def test_what_lies_behind_a_seam_is_shifted_and_the_middle_is_not() -> None:
     moved = DISTORTIONS["seams"].undistorted(pixels := pixels_of(SHAPE)) - pixels
     by_part = {
