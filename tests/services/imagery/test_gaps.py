@@ -6,7 +6,7 @@ import pytest
 
 from amers.services.imagery.gaps import bridged, filled, lost_pixels
 from amers.services.imagery.resampling import resample, spline_coefficients
-from amers.services.imagery.source import ArrayImage, block_means, low_pass, sample_image
+from amers.services.imagery.source import ArrayImage, low_pass, sample_image
 from amers.services.types import FloatImage
 
 a_tenth_of_the_contrast = 0.1
@@ -129,15 +129,6 @@ def test_a_gap_has_the_same_effect_in_every_window() -> None:
     positions = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
     whole, part = sample_image(image, positions, 2.5), sample_image(image, positions[20:60, 20:60], 2.5)
     np.testing.assert_allclose(part, whole[20:60, 20:60], atol=0.05)
-
-
-def test_filters_of_clean_pixels_are_those_of_opencv() -> None:
-    pixels = ground()
-    np.testing.assert_array_equal(
-        block_means(pixels, 4), cv2.resize(pixels, (50, 50), interpolation=cv2.INTER_AREA)
-    )
-    spline = resample(spline_coefficients(pixels), np.argwhere(pixels > 0.0).astype(float))
-    np.testing.assert_allclose(spline.reshape(pixels.shape), pixels, atol=0.1)
 
 
 def test_a_low_pass_bridges_gaps_and_keeps_areas_lost() -> None:

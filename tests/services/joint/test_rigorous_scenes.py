@@ -193,15 +193,26 @@ def test_a_rigorous_scene_that_joins_agrees_with_one_adjustment_of_all_scenes() 
     assert 0.2 < np.mean(accurate) < 2.0
 
 
-def test_a_scene_with_other_free_parameters_cannot_join() -> None:
+@pytest.mark.parametrize(
+    ("wave_px", "free", "told"),
+    [
+        ((0.0, 0.0), TOUTIN, "the parameters roll, .* are free, and the n"),
+        ((5.0, 3.0), SRP, ".* register the scenes of both together"),
+    ],
+    ids=["other free parameters", "a satellite that turns, whose motion is not kept"],
+)
+def test_a_scene_that_cannot_join_is_refused(
+    wave_px: tuple[float, float], free: ParameterSet, told: str
+) -> None:
     rng = np.random.default_rng(33)
     truth = mixed(rng)
-    scenes, ties = observed(truth, rng)
+    oscillating = rigorous_truth(plan_of(0, wave_px=wave_px), SRP, rng)
+    scenes, ties = observed(replace(truth, images=(oscillating, *truth.images[1:])), rng)
     first, _ = adjust_fitting(scenes[:2], ties_between(ties, [0, 1]), OPTIONS)
-    none = np.zeros(0, np.int64)
-    other = replace(scenes[0].scene, parameter_set=TOUTIN)
-    before = [nothing_found(scene, scenes[0].points.take(none)) for scene in (other, scenes[1].scene)]
-    with pytest.raises(InputError, match=r"image 1: the parameters roll, .* are free, and the n"):
+    none = scenes[0].points.take(np.zeros(0, np.int64))
+    other = replace(scenes[0].scene, parameter_set=free)
+    before = [nothing_found(scene, none) for scene in (other, scenes[1].scene)]
+    with pytest.raises(InputError, match=f"image 1: {told}"):
         adjust_fitting(
             [*before, scenes[2]], ties_between(ties, [0, 1, 2]), OPTIONS, first.adjustment.known
         )
@@ -281,23 +292,6 @@ def test_a_rigorous_scene_that_oscillates_is_followed_with_the_stated_accuracy(
     assert all(attitudes)
     assert 0.5 < np.mean(squares) < 1.7
     assert np.median(errors) < 0.35 * np.hypot(*wave_px)
-
-
-@pytest.mark.long
-def test_a_scene_joins_no_block_in_which_a_satellite_turns() -> None:
-    """The motion is not kept with the block: all scenes have to be registered together."""
-    rng = np.random.default_rng(39)
-    truth = mixed(rng)
-    oscillating = rigorous_truth(plan_of(0, wave_px=(5.0, 3.0)), SRP, rng)
-    truth = replace(truth, images=(oscillating, *truth.images[1:]))
-    scenes, ties = observed(truth, rng)
-    first, _ = adjust_fitting(scenes[:2], ties_between(ties, [0, 1]), OPTIONS)
-    none = np.zeros(0, np.int64)
-    before = [nothing_found(one.scene, one.points.take(none)) for one in scenes[:2]]
-    with pytest.raises(InputError, match=r"image 1: .* register the scenes of both together"):
-        adjust_fitting(
-            [*before, scenes[2]], ties_between(ties, [0, 1, 2]), OPTIONS, first.adjustment.known
-        )
 
 
 @pytest.mark.monte_carlo

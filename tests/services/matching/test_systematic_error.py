@@ -145,13 +145,6 @@ def test_the_offset_of_an_image_that_dominates_is_stated_though_hardly_seen() ->
     assert error_px[0] ** 2 < uneven[0, 0] < 4.2 * error_px[0] ** 2
 
 
-def test_without_a_measure_the_error_is_the_smallest() -> None:
-    empty = common_covariance_px2(
-        LIKE_THE_SCENE, views_of(LIKE_THE_SCENE), np.arange(0), np.zeros((0, 2)), np.zeros(0)
-    )
-    np.testing.assert_allclose(empty, COMMON_SIGMA_PX**2 * np.eye(2))
-
-
 def test_views_count_by_their_weights_in_what_parallax_makes_of_heights() -> None:
     """A quarter of the weight looks from the other side; what agrees with nothing has none."""
     n = 30
@@ -178,8 +171,9 @@ def test_an_unknown_sun_is_worse_than_one_with_other_shadows() -> None:
     assert 2.0 * lower[1, 1] < unknown[1, 1] < 8.0 * lower[1, 1]
 
 
-def test_views_that_agree_with_nothing_tell_nothing_of_directions() -> None:
-    n = 12
-    across = views_of(replace(LIKE_THE_SCENE, azimuth_deg=SOUTH, sun_elevation_deg=20.0), n)
-    found = common_covariance_px2(LIKE_THE_SCENE, across, np.arange(n), np.zeros((n, 2)), np.zeros(n))
+@pytest.mark.parametrize("count", [0, 12])
+def test_without_a_view_that_agrees_the_error_is_the_smallest(count: int) -> None:
+    across = views_of(replace(LIKE_THE_SCENE, azimuth_deg=SOUTH, sun_elevation_deg=20.0), 12)
+    none = np.zeros((count, 2))
+    found = common_covariance_px2(LIKE_THE_SCENE, across, np.arange(count), none, none[:, 0])
     np.testing.assert_allclose(found, COMMON_SIGMA_PX**2 * np.eye(2), atol=1e-12)

@@ -69,7 +69,6 @@ def off_m(registration: Registration) -> float:
 
 def test_marks_of_a_survey_place_what_a_base_leaves_open() -> None:
     alone, both = registered(False), registered(True)
-    print(f"off by {off_m(alone):.2f} m on the base, {off_m(both):.2f} m with the marks")
     assert off_m(alone) > 1.5
     assert off_m(both) < 0.8
     assert both.qualification.point_counts.active > alone.qualification.point_counts.active

@@ -14,7 +14,6 @@ from amers.services.simulation.archive import (
     GSD_M,
     IMAGE_SIGMA_M,
     LAST_DAY,
-    LATER_ERROR_M,
     PASS_SIGMA_M,
     SMALL,
     ArchiveView,
@@ -63,18 +62,6 @@ def test_errors_of_passes_and_of_their_images_are_as_large_as_stated() -> None:
             assert {view.stated_m for view in views} == {(PASS_SIGMA_M, IMAGE_SIGMA_M)}
     np.testing.assert_allclose(np.std(shared, axis=0), PASS_SIGMA_M, rtol=0.15)
     np.testing.assert_allclose(np.std(own, axis=0), IMAGE_SIGMA_M, rtol=0.1)
-
-
-def test_errors_of_later_images_have_their_range_in_all_directions() -> None:
-    views = [view for seed in range(10) for view in later_views(CONTINENT, seed)]
-    errors = np.array([view.error_m for view in views])
-    length = np.hypot(*errors.T)
-    assert LATER_ERROR_M[0] <= length.min() < 4.0
-    assert 19.0 < length.max() <= LATER_ERROR_M[1]
-    np.testing.assert_allclose(errors.mean(axis=0), 0.0, atol=3.0)
-    assert {view.stated_m for view in views} == {(LATER_ERROR_M[1] / 2.0, 0.0)}
-    reach_m = (CONTINENT.area_m - CONTINENT.later_lines * GSD_M) / 2.0
-    np.testing.assert_allclose(np.abs(places_m(views)).max(axis=0), reach_m, rtol=0.05)
 
 
 @pytest.mark.parametrize("views_of", [archive_views, later_views, older_views])
