@@ -72,39 +72,33 @@ def products(folder: Path) -> tuple[tuple[PushbroomModel, RpcModel], ...]:
     )
 
 
-def product(model: PushbroomModel, rpc: RpcModel, name: str, rng: np.random.Generator) -> Product:
+def product(model: PushbroomModel, rpc: RpcModel, rng: np.random.Generator) -> Product:
     """With its rigorous model, off by a draw of its set."""
     near = replace(model, height_range_m=rpc.height_range_m)
-    image = rigorous_parameters(name, near, SRP, sigma_m=SIGMA_M)
-    return of_plan(name, rpc, image.corrected(rng.normal(0.0, image.sigma)), SRP)
+    image = rigorous_parameters("orbit", near, SRP, sigma_m=SIGMA_M)
+    delivered = image.corrected(rng.normal(0.0, image.sigma))
+    return Product(plan_of("orbit", model.image_shape), None, NO_ERROR, rpc, delivered, SRP)  # type: ignore[arg-type]
 
 
-def with_rpc(rpc: RpcModel, shape: tuple[int, int], name: str, rng: np.random.Generator) -> Product:
+def with_rpc(rpc: RpcModel, shape: tuple[int, int], rng: np.random.Generator) -> Product:
     """With the RPC of its vendor, off by a shift, a drift and a skew."""
-    image = image_parameters(name, rpc, shape, shift_px=SIGMA_M / 0.5, slope_px=1.0)
-    corrected = image.corrected(rng.normal(0.0, image.sigma))
-    return of_plan(name, rpc, corrected, None, shape)
+    image = image_parameters("rpc", rpc, shape, shift_px=SIGMA_M / 0.5, slope_px=1.0)
+    delivered = image.corrected(rng.normal(0.0, image.sigma))
+    return Product(plan_of("rpc", shape), None, NO_ERROR, rpc, delivered, None)  # type: ignore[arg-type]
 
 
-def of_plan(
-    name: str,
-    rpc: RpcModel,
-    delivered: SensorModel,
-    free: ParameterSet | None,
-    shape: tuple[int, int] | None = None,
-) -> Product:
-    size = delivered.image_shape if isinstance(delivered, PushbroomModel) else shape
-    assert size is not None
-    plan = ImagePlan(name, (0.0, 0.0), 0.0, 0.0, size, 0.5, sigma_m=SIGMA_M)
-    none = ImageCorrection(np.zeros((2, 3)), np.zeros(2), np.ones(2))
-    return Product(plan, None, none, rpc, delivered, free)  # type: ignore[arg-type]
+NO_ERROR = ImageCorrection(np.zeros((2, 3)), np.zeros(2), np.ones(2))
+
+
+def plan_of(name: str, shape: tuple[int, int]) -> ImagePlan:
+    return ImagePlan(name, (0.0, 0.0), 0.0, 0.0, shape, 0.5, sigma_m=SIGMA_M)
 
 
 def block_of(folder: Path, seed: int, *, control: int = 60) -> tuple[JointTruth, JointBlock]:
     """A pair of WorldView-2: the first with its orbit and attitude, the second with its RPC."""
     rng = np.random.default_rng([51, seed])
     (model, first), (other, second) = products(folder)
-    images = [product(model, first, "orbit", rng), with_rpc(second, other.image_shape, "rpc", rng)]
+    images = [product(model, first, rng), with_rpc(second, other.image_shape, rng)]
     middle = np.append(first.ground_offset[:2], first.ground_offset[2])
     extent_m = np.array([-6500.0, 6500.0, -5500.0, 5500.0])
     relief_m = 0.6 * min(first.ground_scale[2], second.ground_scale[2])

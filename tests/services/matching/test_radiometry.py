@@ -1,6 +1,7 @@
 """Ground whose contrast has changed is found by its gradients; points under clouds are recognised."""
 
 import numpy as np
+import pytest
 
 from amers.services.matching.correlate import FOUND, CorrelationOptions, find_chip
 from amers.services.matching.radiometry import cloud_mask, gradient_image, patch_statistics
@@ -61,8 +62,13 @@ def ground_and_clouds(rng: np.random.Generator) -> tuple[list[Array], dict[str, 
     return statistics, kinds
 
 
-def test_bright_and_smooth_surroundings_of_a_missing_point_are_a_cloud() -> None:
+@pytest.mark.parametrize("saturated", [False, True])
+def test_bright_and_smooth_surroundings_of_a_missing_point_are_a_cloud(saturated: bool) -> None:
     statistics, kinds = ground_and_clouds(np.random.default_rng(0))
+    if saturated:
+        statistics[kinds["cloud"]][:] = [np.inf, 0.0]
+        # The brightest ground found may be saturated too, and says nothing about the rest.
+        statistics[0][:2] = [np.inf, 0.0]
     hidden = cloud_mask(statistics, np.arange(40) < 20)
     assert list(np.flatnonzero(hidden)) == [kinds["cloud"], kinds["part of a cloud"]]
 
@@ -83,12 +89,3 @@ def test_squares_have_the_statistics_of_their_valid_pixels() -> None:
     np.testing.assert_allclose(statistics[:6], [[2.0, 2.0]] * 6)
     assert np.isnan(statistics[6]).all()
     assert list(statistics[7]) == [np.inf, 0.0]
-
-
-def test_saturated_surroundings_of_a_missing_point_are_a_cloud() -> None:
-    statistics, kinds = ground_and_clouds(np.random.default_rng(0))
-    statistics[kinds["cloud"]][:] = [np.inf, 0.0]
-    # The brightest ground found may be saturated too, and says nothing about the rest.
-    statistics[0][:2] = [np.inf, 0.0]
-    hidden = cloud_mask(statistics, np.arange(40) < 20)
-    assert list(np.flatnonzero(hidden)) == [kinds["cloud"], kinds["part of a cloud"]]
