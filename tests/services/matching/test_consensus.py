@@ -7,6 +7,7 @@ import pytest
 from amers.services.matching.consensus import (
     Consensus,
     Voters,
+    _scatter_px,
     a_contrario_consensus,
     affine_inliers,
     robust_affine_inliers,
@@ -196,6 +197,15 @@ def test_few_points_worse_than_declared_are_kept(count: int) -> None:
         inliers, _ = robust_affine_inliers(position, displacement, np.ones(count, dtype=bool), 2.0)
         kept.append(inliers.mean())
     assert np.mean(kept) > 0.8
+
+
+@pytest.mark.parametrize("count", [8, 20])
+def test_the_scatter_of_few_points_is_that_which_they_were_drawn_with(count: int) -> None:
+    """An affine field of so few passes nearer to them than the true one."""
+    rng, all_of_them = np.random.default_rng(count), np.ones(count, dtype=bool)
+    drawn = rng.uniform(0.0, 700.0, (300, count, 2)), rng.normal(0.0, 6.0, (300, count, 2))
+    found = [_scatter_px(at, off, all_of_them, all_of_them, 1e9) for at, off in zip(*drawn, strict=True)]
+    assert np.mean(found) == pytest.approx(6.0, rel=0.08)
 
 
 def test_inliers_are_candidates() -> None:

@@ -19,7 +19,6 @@ pytestmark = pytest.mark.long
 
 half_a_pixel = 0.5
 a_quarter_of_a_pixel = 0.25
-a_micropixel = 1e-6
 SIGMA_M = 15.0
 
 
@@ -83,10 +82,7 @@ FIRST = next(iter(VIEWS))
 def test_a_scene_is_registered_in_the_frame_of_the_block(name: str) -> None:
     assert ce90_px(view_of(name), registration(name)) < half_a_pixel
     assert registration(name).qualification.verdict == "good"
-
-
-def test_a_skewed_scene_needs_an_affine() -> None:
-    assert registration(FIRST).adjustment.order == "affine"
+    assert name != FIRST or registration(name).adjustment.order == "affine"
 
 
 @names

@@ -34,7 +34,6 @@ LINES, GSD_M = 5000, 20.0
 SHIFT_PX = np.array([180.0, -165.0])
 """4.9 km."""
 LEVEL_M = 20.0
-forty_metres = 40.0
 of_three_level_pixels = 3.0 * LEVEL_M
 
 
