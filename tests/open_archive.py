@@ -120,7 +120,7 @@ def make_archive(folder: Path, seed: int = 7, dates: int = DATES) -> OpenArchive
         for tile in TILES:
             archive.items.append(_write_granule(archive, tile, date, light, rng))
     archive.items.append(_write_heights(archive, rng.spawn(1)[0]))
-    _write_geoid(archive.geoid)
+    write_geoid(archive.geoid)
     document = {"type": "FeatureCollection", "features": archive.items}
     (folder / "items.json").write_text(json.dumps(document))
     return archive
@@ -299,10 +299,10 @@ def _write_heights(archive: OpenArchive, rng: np.random.Generator) -> dict[str, 
     }
 
 
-def _write_geoid(path: Path) -> None:
+def write_geoid(path: Path, centre: tuple[float, float] = CENTRE) -> None:
     """A geoid that is level, as GTX."""
     rows, columns = 41, 41
-    header = struct.pack(">4d2i", CENTRE[1] - 2.0, CENTRE[0] - 2.0, 0.1, 0.1, rows, columns)
+    header = struct.pack(">4d2i", centre[1] - 2.0, centre[0] - 2.0, 0.1, 0.1, rows, columns)
     path.write_bytes(header + np.full((rows, columns), GEOID_M, dtype=">f4").tobytes())
 
 
