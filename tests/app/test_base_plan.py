@@ -1,13 +1,19 @@
 """A plan of a region of 10,000 km² from a catalogue alone: its tiles, bytes and hours."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+import shapely
 
+from amers.app.errors import InputError
 from amers.app.usecases.base.making import plan
-from amers.app.usecases.base.request import BaseRequest
+from amers.app.usecases.base.request import BaseOptions, BaseRequest, area_km2, area_of
+from amers.app.usecases.base.search import spacing_m
+from amers.services.imagery.archives import SENTINEL_2
+from tests.command_line import amers_here
 
 TILE_DEG = 1.0, 1.36
 """Height and width of a tile of 110 km at 43 degrees; tiles overlap by a tenth."""
@@ -73,3 +79,78 @@ def test_a_small_region_takes_a_small_part_of_the_tiles(catalogue: str) -> None:
     share = sum(date.pixels for date in planned.dates) / planned.full_pixels
     print(f"{planned.area_km2:,.0f} km2, {share:.3f} of the pixels of the full tiles")
     assert share < 1.0 / 3.0
+
+
+def test_the_plan_is_shown_as_it_is_and_more_processes_take_less_time(catalogue: str) -> None:
+    words = ["base", "make", "--plan", "--from", "sentinel-2", "--catalogue", catalogue, "-o", "b"]
+    shown = {
+        jobs: json.loads(
+            amers_here([*words, "--bbox", *map(str, REGION), "--jobs", jobs, "--json"], {}).stdout
+        )
+        for jobs in (1, 5)
+    }
+    planned, candidates = plan(BaseRequest("sentinel-2", (catalogue,), bbox=REGION))
+    images = [candidates.images[date.image] for date in planned.dates]
+    for jobs, row in shown.items():
+        expected_s = planned.read_s + planned.cpu_s / jobs
+        assert 60.0 * row.pop("minutes") == pytest.approx(expected_s, abs=3.1)
+        assert row == {
+            "area_km2": pytest.approx(planned.area_km2, abs=0.06),
+            "tiles": [tile.tile for tile in planned.tiles],
+            "dates": sorted({image.date for image in images}),
+            "images": [image.id for image in images],
+            "points": planned.points,
+            "bytes": planned.bytes,
+            "size": f"{planned.bytes / 2**30:.1f} GiB",
+            "bytes_per_km2": pytest.approx(planned.bytes / planned.area_km2, abs=0.6),
+            "share_of_full_tiles": pytest.approx(
+                sum(date.pixels for date in planned.dates) / planned.full_pixels, abs=1e-4
+            ),
+            "items_left_out": 0,
+        }
+
+
+@pytest.mark.parametrize(
+    ("side_km", "expected_m"), [(100.0, 1000.0), (4.0, 632.5), (0.5, 250.0), (0.0001, 250.0)]
+)
+def test_squares_are_a_hundred_pixels_less_in_small_regions_and_a_quarter_of_that_at_least(
+    side_km: float, expected_m: float
+) -> None:
+    found = {
+        gsd_m: spacing_m(BaseOptions(), replace(SENTINEL_2, gsd_m=gsd_m), side_km**2)
+        for gsd_m in (10.0, 40.0)
+    }
+    assert found[10.0] == pytest.approx(expected_m, abs=0.1)
+    assert 1000.0 <= found[40.0] <= 4000.0
+    assert spacing_m(BaseOptions(spacing_m=70.0), SENTINEL_2, side_km**2) == 70.0
+
+
+def test_the_area_of_a_region_is_that_of_all_its_parts_each_at_its_latitude() -> None:
+    boxes = [shapely.box(0.0, 0.0, 1.0, 2.0), shapely.box(10.0, 59.5, 11.0, 60.5)]
+    # A degree along the meridian and along the parallel (WGS 84), in kilometres.
+    expected = [2.0 * 110.58 * 111.31, 111.41 * 55.80]
+    assert [area_km2(box) for box in boxes] == pytest.approx(expected, rel=5e-3)
+    assert area_km2(shapely.union_all(boxes)) == pytest.approx(sum(expected), rel=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("box", "said"),
+    [
+        ((-180.0, -85.0, -179.9, -84.9), ""),
+        ((179.9, 84.9, 180.0, 85.0), ""),
+        ((-180.1, 0.0, -179.9, 0.1), "within 180"),
+        ((0.0, 84.9, 0.1, 85.1), "within 85"),
+        ((0.0, -85.1, 0.1, -85.0), "within 85"),
+        ((1.0, 0.0, 1.0, 0.1), "W < E"),
+        ((0.0, 0.1, 0.1, 0.1), "S < N"),
+        ((0.0, 0.0, 4.0, 4.05), ""),
+        ((0.0, 0.0, 4.0, 4.1), "up to 200,000 expected"),
+    ],
+)
+def test_the_limits_of_a_region_are_its_own(box: tuple[float, float, float, float], said: str) -> None:
+    request = BaseRequest("sentinel-2", ("catalogue",), bbox=box)
+    if not said:
+        assert area_of(request).bounds == box
+        return
+    with pytest.raises(InputError, match=said):
+        area_of(request)

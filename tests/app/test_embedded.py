@@ -17,7 +17,7 @@ import pytest
 
 from amers.app.db.cluster import binaries, embedded
 from amers.app.db.cluster.binaries import find_binaries, server_user
-from amers.app.db.cluster.embedded import LONGEST_SOCKET_PATH, Cluster
+from amers.app.db.cluster.embedded import LONGEST_SOCKET_PATH, SOCKET_NAME, Cluster
 from amers.app.errors import InputError
 
 pytestmark = pytest.mark.long
@@ -228,6 +228,19 @@ def test_a_path_too_long_for_a_socket_gets_a_private_folder_elsewhere(bare):
         assert connection.execute("select 1").fetchone() == (1,)
         assert deep.sockets.parent == Path("/tmp")
     assert not deep.sockets.exists()
+
+
+@pytest.mark.parametrize("letter", ["d", "ü"])
+def test_the_path_of_a_socket_is_never_too_long_and_in_the_folder_wherever_it_fits(letter):
+    """Bytes count, of which a letter can have two."""
+    for length in range(130):
+        cluster = Cluster(Path("/x" + letter * length))
+        own = cluster.folder / "socket"
+        path = len(os.fsencode(cluster.sockets / SOCKET_NAME))
+        assert path <= 107
+        assert (cluster.sockets == own) == (len(os.fsencode(own / SOCKET_NAME)) <= 107)
+    for wrong in ",'\"\\\n":
+        assert Cluster(Path(f"/x{wrong}y")).sockets.parent == Path("/tmp")
 
 
 def test_a_socket_folder_that_others_could_have_made_is_refused(bare):

@@ -28,11 +28,18 @@ FRAMES_M2 = {
     2: [[25.0, 0.0, 0.0], [0.0, 0.01, 0.0], [0.0, 0.0, 4.0]],
 }
 """Covariances of the frames that two of the blocks state, east, north and up; the third states none."""
+APART_DEG = {2: 5.21, 3: 5.28}
+"""Where the points of two blocks with one extent begin, degrees east."""
 EDITS = (
     *(
         f"update block set metadata = jsonb_set(metadata, '{{amers:frame}}',"
         f" '{{\"covariance_m2\": {frame}}}') where number = {number}"
         for number, frame in FRAMES_M2.items()
+    ),
+    *(
+        f"update point set geom = st_setsrid(st_makepoint({lon} + 0.001 * (id & 7), 43.22, 200), 4979)"
+        f" where block_number = {number}"
+        for number, lon in APART_DEG.items()
     ),
     'update scene set models = \'{"a.rpb": {"size_bytes": 17}, "b": {"size_bytes": 25}}\''
     " where name = 'scene.tif'",
@@ -214,6 +221,7 @@ def test_every_block_gets_an_outline_of_its_points(way: Way) -> None:
             if row["block_number"] == block["number"]
         ]
         assert shapely.distance(outline, points).max() < 1e-8, block["number"]
+        assert shapely.hausdorff_distance(outline, shapely.MultiPoint(points)) < 0.01, block["number"]
         assert extent.buffer(1e-8).covers(outline)
 
 
