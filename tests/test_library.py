@@ -7,12 +7,14 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 import amers
+from amers import geometry
 from amers.app.usecases.vector_files import CorrectionOptions
 from amers.services.matching.tie_points import MatchOptions
 from amers.services.mosaic.options import MosaicOptions
@@ -259,6 +261,30 @@ def test_what_was_stated_of_a_scene_goes_with_it(
     texts = " ".join(text for _, text in notes)
     is_opened = "read_scene()" in texts.split()
     assert is_opened or all(text in texts for text in ("own.rpb", "41.25", "43.25"))
+
+
+@pytest.mark.parametrize("gsds_m", [(1.5, 4.0), (4.0, 1.5)])
+def test_images_are_matched_at_the_sampling_of_the_coarser_one(
+    gsds_m: tuple[float, float], monkeypatch: pytest.MonkeyPatch
+):
+    scenes = dict(zip(("a.tif", "b.tif"), gsds_m, strict=True))
+    samplings = list[float]()
+    nothing = SimpleNamespace(line_sample=np.zeros((0, 2)))
+    monkeypatch.setattr(geometry, "as_scene", lambda path: SimpleNamespace(content=path))
+    monkeypatch.setattr(geometry, "scene_gsd_m", scenes.__getitem__)
+    monkeypatch.setattr(geometry, "find_features", lambda _, gsd_m: samplings.append(gsd_m) or nothing)
+    monkeypatch.setattr(
+        geometry,
+        "match_features",
+        lambda *_, gsd_m, **__: (
+            samplings.append(gsd_m)
+            or SimpleNamespace(rows=np.zeros((0, 2), dtype=int), similarity=np.zeros(0))
+        ),
+    )
+    for given, expected in ((None, 4.0), (2.5, 2.5)):
+        amers.match_images(*scenes, gsd_m=given)
+        assert samplings == [expected] * 3
+        samplings.clear()
 
 
 @pytest.fixture(scope="module")

@@ -67,3 +67,17 @@ def test_what_is_missing_says_how_to_get_it(
     assert "make page" in parts["map page"].found
     assert parts["data folder"].status == "degraded"
     assert "free some room" in parts["data folder"].found
+
+
+@pytest.mark.parametrize(
+    ("settings_free", "working_free"), [(True, False), (False, True), (False, False)]
+)
+def test_room_is_short_where_less_is_free_than_the_settings_or_large_scenes_need(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch, *, settings_free: bool, working_free: bool
+) -> None:
+    monkeypatch.setattr(doctor, "_WORKING_BYTES", 1 if working_free else 1 << 60)
+    least = settings.model_copy(update={"min_free_bytes": 1 if settings_free else 1 << 60})
+    room = doctor._room(least)
+    assert room.status == "degraded"
+    monkeypatch.setattr(doctor, "_WORKING_BYTES", 1)
+    assert doctor._room(settings.model_copy(update={"min_free_bytes": 1})).status == "ok"

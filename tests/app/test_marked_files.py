@@ -18,6 +18,7 @@ from amers.services.imagery.scene import Scene
 from amers.services.imagery.source import ArrayImage
 from amers.services.production.control import Control
 from amers.services.types import Acquisition
+from tests.geotiffs import write_geotiff
 from tests.services.simulated import ring_of_geometries
 
 IMAGES = [Path("one.tif"), Path("two.tif")]
@@ -169,18 +170,8 @@ def test_statements_without_a_file_of_points_and_missing_paths_are_refused(tmp_p
 
 def map_file(folder: Path, name: str) -> Path:
     path = folder / name
-    with rasterio.open(
-        path,
-        "w",
-        driver="GTiff",
-        width=20,
-        height=20,
-        count=1,
-        dtype="float32",
-        crs="EPSG:32633",
-        transform=rasterio.Affine(10.0, 0.0, 500000.0, 0.0, -10.0, 5000000.0),
-    ) as raster:
-        raster.write(np.ones((1, 20, 20), dtype=np.float32))
+    place = rasterio.Affine(10.0, 0.0, 500000.0, 0.0, -10.0, 5000000.0)
+    write_geotiff(path, np.ones((1, 20, 20), dtype=np.float32), crs="EPSG:32633", transform=place)
     return path
 
 

@@ -19,6 +19,7 @@ from amers.services.types import Array
 from tests.app.callers import Bearer, Caller
 from tests.app.flat_world import CENTRE, GROUND_H, SIGMA_M, FlatWorld, make_flat_world
 from tests.app.worker_processes import ended, running_worker
+from tests.geotiffs import write_geotiff
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
@@ -200,9 +201,7 @@ def test_marks_in_an_ortho_image_need_no_heights(tmp_path: Path) -> None:
     """A map grid that is moved by 12 m comes back, from a document of its model."""
     path, moved_m = tmp_path / "ortho.tif", np.array([12.0, -5.0])
     grid = rasterio.transform.from_origin(700_000.0, 4_800_000.0, 2.0, 2.0)
-    profile = {"driver": "GTiff", "width": 400, "height": 300, "count": 1, "dtype": "uint8"}
-    with rasterio.open(path, "w", **profile, crs="EPSG:32631", transform=grid) as file:
-        file.write(np.ones((300, 400), dtype=np.uint8), 1)
+    write_geotiff(path, np.ones((300, 400), dtype=np.uint8), crs="EPSG:32631", transform=grid)
     scene = parse_scene_model(format_scene_model(read_scene(path, sigma_m=10.0)), "scene_model.json")
     picked = np.array([[50.0, 60.0], [250.0, 90.0], [120.0, 350.0]])
     ground = scene.model.locate(picked + moved_m / 2.0, np.zeros(3))

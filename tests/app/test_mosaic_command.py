@@ -31,6 +31,7 @@ from amers.services.types import Frame
 from tests.command_line import amers_here
 from tests.factories import BOX, affine_model, control_points, metadata, noise_chips
 from tests.factories import images as images_of
+from tests.geotiffs import write_geotiff
 from tests.services.mosaic.worlds import picture
 
 pytestmark = pytest.mark.long
@@ -200,18 +201,8 @@ def test_models_of_a_block_have_the_accuracy_of_its_frame(
 
 def test_a_scene_beyond_the_terrain_is_named(images: tuple[Path, ...], tmp_path: Path) -> None:
     dem = tmp_path / "dem.tif"
-    with rasterio.open(
-        dem,
-        "w",
-        driver="GTiff",
-        height=20,
-        width=20,
-        count=1,
-        dtype="float32",
-        crs="EPSG:4326",
-        transform=from_origin(20.0, 20.0, 0.001, 0.001),
-    ) as file:
-        file.write(np.zeros((20, 20), np.float32), 1)
+    place = from_origin(20.0, 20.0, 0.001, 0.001)
+    write_geotiff(dem, np.zeros((20, 20), np.float32), crs="EPSG:4326", transform=place)
     words = ["scene", "mosaic", *images, "-o", tmp_path / "m.tif", "--dem", dem]
     done = amers_here([*words, "--vertical", "ellipsoid"], {"PATH": ""})
     assert done.returncode != 0

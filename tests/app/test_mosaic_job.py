@@ -20,6 +20,7 @@ from tests.app.callers import Bearer, Caller
 from tests.app.ledger import job_runner, make_token
 from tests.app.surface_world import OFF_PX, write_pair, write_registrations
 from tests.app.test_surface_job import registered
+from tests.geotiffs import write_geotiff
 
 LOOKS = ("left", "right")
 MADE = {"gsd_m": 1.0, "height_m": 150.0}
@@ -95,20 +96,10 @@ def test_heights_come_from_a_file_below_the_folder_of_references(
     with rasterio.open(folder / "left.tif") as image:
         centre = image.rpcs
     step = 0.001
-    with rasterio.open(
-        references / "ground.tif",
-        "w",
-        driver="GTiff",
-        height=60,
-        width=60,
-        count=1,
-        dtype="float32",
-        crs="EPSG:4326",
-        transform=rasterio.transform.from_origin(
-            centre.long_off - 30 * step, centre.lat_off + 30 * step, step, step
-        ),
-    ) as file:
-        file.write(np.full((60, 60), MADE["height_m"], dtype=np.float32), 1)
+    west, north = centre.long_off - 30 * step, centre.lat_off + 30 * step
+    ground = np.full((60, 60), MADE["height_m"], dtype=np.float32)
+    place = rasterio.transform.from_origin(west, north, step, step)
+    write_geotiff(references / "ground.tif", ground, crs="EPSG:4326", transform=place)
     with_folder = settings.model_copy(update={"reference_folder": references})
     run = job_runner(client, database, with_folder, me)
     common = {"scenes": ids, "gsd_m": 1.0, "vertical": "ellipsoid"}

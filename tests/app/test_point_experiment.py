@@ -99,6 +99,20 @@ def test_ground_of_check_points_has_no_part_in_any_model(folder: Path) -> None:
         np.testing.assert_allclose(other.rms_m[:2], one.rms_m[:2], atol=a_tenth_of_a_millimetre)
 
 
+def test_a_point_with_a_wrong_mark_is_left_out_whether_its_ground_is_known_or_not(folder: Path) -> None:
+    wrong = {f"P{number:03}": "left" for number in (4, KNOWN + 1)}
+    lines = []
+    for line in (folder / "marks.csv").read_text().splitlines():
+        fields = line.split(",")
+        if [wrong.get(fields[0])] == fields[1:2]:
+            fields[2:4] = [str(float(value) + 9.0) for value in fields[2:4]]
+        lines.append(",".join(fields))
+    (folder / "wrong.csv").write_text("\n".join(lines) + "\n")
+    result = run_experiment(files(folder, "wrong.csv"), (POINT_M, POINT_M), (4,), TWICE)
+    assert (result.points, result.ties) == (KNOWN - 1, TIES - 1)
+    assert [note.partition(":")[0] for note in result.notes] == [f"point {name}" for name in wrong]
+
+
 def test_what_is_not_stated_or_too_little_is_refused(folder: Path) -> None:
     with pytest.raises(InputError, match=r"20 points, such as P000, have no sigma .*--point-sigma-m"):
         run_experiment(files(folder), None)

@@ -189,27 +189,42 @@ def test_known_ground_is_compared_and_of_it_the_check_points_alone_where_there_a
     assert every.rms_m[2] == pytest.approx(40.0 / np.sqrt(7.0), rel=0.1)
 
 
+def register(folder: Path, covariance_px2: Array) -> None:
+    """Write the registrations of the images, none of which is corrected."""
+    for name, geometry in zip(NAMES, ring_of_geometries(3), strict=True):
+        (folder / name).mkdir(parents=True)
+        accuracy = CorrectionAccuracy(
+            no_correction(geometry.plan.shape), covariance_px2, np.zeros(2), Frame.from_sigmas(2.0, 3.0)
+        )
+        order = "affine" if covariance_px2[1, 1] else "shift"
+        text = format_correction(accuracy, order, applies_to=f"{name}.tif", carried="approximately")
+        (folder / name / "correction.json").write_text(text)
+
+
+def test_the_names_of_points_and_the_order_of_rows_change_nothing(folder: Path, tmp_path: Path) -> None:
+    """Errors of registered models grow towards the edges of the images: no point counts more."""
+    rng = np.random.default_rng(9)
+    rows = marks(folder, truth(5, rng), rng)
+    register(tmp_path / "registered", np.diag([0.01, 0.09, 0.04, 0.02, 0.05, 0.08]))
+    renamed = [[f"P{4 - int(name[1:]):03}", *row] for name, *row in rows[::-1]]
+    found = []
+    for file, given in (("one.csv", rows), ("other.csv", renamed)):
+        files = MarkedImages((table(tmp_path / file, given),), images(folder))
+        found.append(intersect_files(replace(files, registered=tmp_path / "registered")).points)
+    for point, same in zip(found[0], found[1][::-1], strict=True):
+        assert (point.lon, point.lat, point.height_m) == pytest.approx(
+            (same.lon, same.lat, same.height_m), abs=1e-9
+        )
+        np.testing.assert_allclose(point.covariance_m2, same.covariance_m2, rtol=1e-6)
+
+
 def test_registered_models_bring_their_own_errors_and_those_of_the_control(
     folder: Path, tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(6)
     ground = truth(6, rng)
     file = table(tmp_path / "marks.csv", marks(folder, ground, rng))
-    for name, geometry in zip(NAMES, ring_of_geometries(3), strict=True):
-        registration = tmp_path / "registered" / name
-        registration.mkdir(parents=True)
-        text = format_correction(
-            CorrectionAccuracy(
-                no_correction(geometry.plan.shape),
-                np.diag([0.09, 0.0, 0.0, 0.09, 0.0, 0.0]),
-                np.zeros(2),
-                Frame.from_sigmas(2.0, 3.0),
-            ),
-            "shift",
-            applies_to=f"{name}.tif",
-            carried="approximately",
-        )
-        (registration / "correction.json").write_text(text)
+    register(tmp_path / "registered", np.diag([0.09, 0.0, 0.0, 0.09, 0.0, 0.0]))
     result = intersect_files(MarkedImages((file,), images(folder), registered=tmp_path / "registered"))
     assert result.relative.label == "Relative to the control points"
     for point in result.points:

@@ -25,6 +25,7 @@ from amers.services.formats.images.scenes import read_scene
 from amers.services.formats.sensor_models.rpc_files import read_rpc
 from amers.services.map_grid import utm_of, xy_of_lon_lat
 from tests.command_line import Done, amers_here
+from tests.geotiffs import write_geotiff
 from tests.services.simulated import ring_of_geometries
 
 GEOMETRY = ring_of_geometries(1, shape=(600, 800))[0]
@@ -274,18 +275,8 @@ def test_marks_of_qgis_take_their_heights_from_a_terrain(image):
     assert "--control-dem" in ended.stderr
     dem = image.with_name("dem.tif")
     west, north = ground[:, 0].min() - 0.01, ground[:, 1].max() + 0.01
-    with rasterio.open(
-        dem,
-        "w",
-        driver="GTiff",
-        height=60,
-        width=60,
-        count=1,
-        dtype="float32",
-        crs="EPSG:4326",
-        transform=from_origin(west, north, 0.0005, 0.0005),
-    ) as file:
-        file.write(np.full((1, 60, 60), 120.0, np.float32))
+    place = from_origin(west, north, 0.0005, 0.0005)
+    write_geotiff(dem, np.full((1, 60, 60), 120.0, np.float32), crs="EPSG:4326", transform=place)
     stated = ["--control-dem", dem, "--control-dem-vertical", "ellipsoid", "--control-dem-sigma-m", "2"]
     ended = register(image, "--control", points, *stated)
     assert ended.returncode == 0, ended.stderr

@@ -1,7 +1,7 @@
 """A renewed version of a block: which points stay, with their own kinds, and what its document says."""
 
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,12 +13,16 @@ import numpy as np
 import pytest
 
 from amers.app.errors import ComputationError, Conflict, InputError
-from amers.app.usecases.blocks import renewal
+from amers.app.usecases.blocks import renewal, renewing_scenes
 from amers.app.usecases.blocks.renewal import Base, next_version, renew_block, stage_renewal
-from amers.app.usecases.blocks.renewing_scenes import SceneOnBlock
+from amers.app.usecases.blocks.renewing_scenes import GoodScene, SceneOnBlock, register_on_block
+from amers.app.usecases.registration.register import SceneFiles
+from amers.services.imagery.scene import Scene
 from amers.services.production.renewed_views import RenewedViews, SeeingScene
+from amers.services.quality.qualification import QualificationOptions
 from amers.services.quality.vanished import Searches, VanishedPoints
-from amers.services.types import no_progress
+from amers.services.registration.options import RegistrationOptions
+from amers.services.types import Acquisition, no_progress
 from tests.factories import control_points, metadata
 
 COUNT = 9
@@ -278,3 +282,54 @@ def test_a_renewal_is_staged_with_the_priority_of_the_version_that_is_still_publ
         monkeypatch.setattr(renewal.blocks, "find_blocks", lambda *_, found=other: found)
         with pytest.raises(Conflict, match="valley@3 is no longer published"):
             stage_renewal(nothing, nothing, base(), Path("new"), no_progress)
+
+
+@pytest.mark.parametrize("known_day", [True, False])
+def test_a_scene_is_registered_on_all_points_whatever_was_asked_of_it_before(
+    monkeypatch: pytest.MonkeyPatch, *, known_day: bool
+) -> None:
+    """Points that a cloud hides were not tried, nor those beyond the image."""
+    asked: list[RegistrationOptions] = []
+    points = replace(control_points(5, np.random.default_rng(2)), id=np.arange(5) * 10)
+
+    def register(scene: Any, on: Any, _: object, options: Any, *, progress: Any) -> Any:
+        assert on is points
+        asked.append(options)
+        number = int(scene.acquisition.image_id[-1])
+        measures = SimpleNamespace(
+            point_id=np.array([0, 20, 30, 40]),
+            active=np.array([number == 0, False, True, True]),
+            reason=np.array(["", "cloud", "", "nodata"]),
+        )
+        qualification = SimpleNamespace(verdict="good")
+        return SimpleNamespace(
+            measures=measures, qualification=qualification, model=f"model {number}", adjustment=number
+        )
+
+    def read(image: Path, *_: object, **__: object) -> Scene:
+        acquired = DAYS[0] if known_day else None
+        pixels: Any = SimpleNamespace(shape=(3, 4), close=lambda: None)
+        model: Any = None
+        return Scene(pixels, model, Acquisition(image.name, acquired_at=acquired), 1.0)
+
+    monkeypatch.setattr(renewing_scenes, "read_scene", read)
+    monkeypatch.setattr(renewing_scenes, "register_scene", register)
+    monkeypatch.setattr(renewing_scenes, "registered_scene", lambda scene, *made: (scene, *made))
+    before = RegistrationOptions(
+        max_points=7, seed=5, qualification=QualificationOptions(max_ce90_on_earth_m=0.1)
+    )
+    given = [
+        GoodScene(f"scene {k}", SceneFiles(Path(f"image {k}")), IDS[k], DAYS[1], before)
+        for k in range(2)
+    ]
+    with ExitStack() as stack:
+        found = register_on_block(points, None, given, stack, no_progress)  # type: ignore[arg-type]
+        with pytest.raises(InputError, match="scene 1: the block has views of an image image 1 already"):
+            register_on_block(points, None, [given[1]] * 2, stack, no_progress)  # type: ignore[arg-type]
+    assert asked[:2] == [replace(before, max_points=0, qualification=QualificationOptions())] * 2
+    for number, one in enumerate(found):
+        assert (one.name, one.registration) == (f"scene {number}", IDS[number])
+        assert one.taken_at == DAYS[0 if known_day else 1]
+        assert one.scene[1:] == (f"model {number}", number)  # type: ignore[index]
+        assert one.searched.tolist() == [0, 3]
+        assert one.found.tolist() == [number == 0, True]

@@ -7,7 +7,6 @@ from uuid import uuid4
 
 import numpy as np
 import pytest
-import rasterio
 
 from amers.app.usecases.blocks.renewing_scenes import GoodScene, register_on_block
 from amers.app.usecases.registration.register import SceneFiles
@@ -16,6 +15,7 @@ from amers.services.formats.block.reader import FolderChips
 from amers.services.types import no_progress
 from tests.app.flat_world import SIGMA_M
 from tests.app.renewal_world import HALF_PX, make_years, write_scene
+from tests.geotiffs import write_geotiff
 
 pytestmark = [pytest.mark.long, pytest.mark.thorough]
 
@@ -37,9 +37,7 @@ def test_points_under_clouds_of_a_mask_were_not_searched_and_those_that_changed_
     half = HALF_PX + 20
     cloud[line - half : line + half, sample - half : sample + half] = 1
     mask = tmp_path / "mask.tif"
-    profile = {"driver": "GTiff", "width": shape[1], "height": shape[0], "count": 1, "dtype": "uint8"}
-    with rasterio.open(mask, "w", **profile) as file:
-        file.write(cloud, 1)
+    write_geotiff(mask, cloud)
     files = SceneFiles(image, sigma_m=SIGMA_M, mask=mask)
     given = GoodScene("later", files, uuid4(), datetime.now(UTC))
     with ExitStack() as stack:

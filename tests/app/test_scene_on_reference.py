@@ -12,6 +12,7 @@ from rasterio.transform import Affine
 
 from amers.app.cli.main import main
 from amers.services.imagery.source import ArrayImage, sample_image
+from tests.geotiffs import write_geotiff
 
 pytestmark = pytest.mark.thorough
 
@@ -31,11 +32,8 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     for name, moved in (("reference", np.zeros(2)), ("scene", SHIFT_PX)):
         seen = sample_image(ArrayImage(ground), pixel - moved, 1.0)
         path = folder / f"{name}.tif"
-        profile = {"driver": "GTiff", "width": SIZE, "height": SIZE, "count": 1, "dtype": "uint16"}
-        with rasterio.open(
-            path, "w", crs="EPSG:32632", transform=Affine(10, 0, 5e5, 0, -10, 5e6), **profile
-        ) as file:
-            file.write(np.clip(seen, 1, 65535).astype(np.uint16), 1)
+        place = Affine(10, 0, 5e5, 0, -10, 5e6)
+        write_geotiff(path, np.clip(seen, 1, 65535).astype(np.uint16), crs="EPSG:32632", transform=place)
         written.append(path)
     return written[0], written[1]
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,13 +15,13 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from amers import open_block
 from amers.app.errors import InputError
 from amers.app.usecases.base.made import MadeBase, report_folder
-from amers.app.usecases.base.making import make_base
+from amers.app.usecases.base.making import _accuracy, make_base
 from amers.app.usecases.base.request import BaseOptions, BaseRequest
 from amers.app.usecases.base.updating import update_base
 from amers.app.usecases.image_production import WorkPlace
 from amers.app.usecases.new_block import BlockIdentity
 from amers.services.formats.block.reader import read_document
-from amers.services.imagery.archives import COPERNICUS_DEM
+from amers.services.imagery.archives import COPERNICUS_DEM, SENTINEL_2
 from amers.services.map_grid import lon_lat_of_xy, xy_of_lon_lat
 from amers.services.types import Array
 from tests.open_archive import GEOID_M, write_cog, write_geoid
@@ -255,3 +256,17 @@ def test_an_update_keeps_half_as_many_dates_again_and_lets_the_oldest_go(
     assert days(updated) == sorted(ERRORS_M)[1:]
     with pytest.raises(InputError, match=r"no image of|no newer image"):
         update_base(folder / "work", tmp_path / "again")
+
+
+@pytest.mark.parametrize("more_m", [0.0, 0.1])
+def test_the_dates_tell_the_accuracy_only_where_they_are_worse_than_the_producer_states(
+    base: MadeBase, more_m: float
+) -> None:
+    frames = replace(base.placed.frames, sigma_m=base.placed.frames.stated_m + more_m, orbits=0)
+    figures = _accuracy(replace(base, placed=replace(base.placed, frames=frames)), SENTINEL_2)
+    assert figures[0].value == frames.sigma_m
+    expected = "the disagreement of 2 dates of 1 orbits" if more_m else "the statement of the producer"
+    assert figures[0].against.startswith(expected)
+    assert [one.name for one in figures] == ["frame_sigma_m", "dates_apart_m", "local_sigma_m"]
+    unknown = _accuracy(replace(base, local_sigma_m=float("nan")), SENTINEL_2)
+    assert [one.name for one in unknown] == ["frame_sigma_m", "dates_apart_m"]

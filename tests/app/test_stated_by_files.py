@@ -10,6 +10,7 @@ import rasterio
 from rasterio.transform import Affine
 
 from tests.command_line import amers_here
+from tests.geotiffs import write_geotiff
 
 ASSUMED = "cut.tif: bands: "
 
@@ -38,18 +39,8 @@ def scene(tmp_path: Path) -> Path:
 def reference(tmp_path: Path) -> Path:
     """An ortho-image of the same ground without any detail."""
     path = tmp_path / "reference.tif"
-    with rasterio.open(
-        path,
-        "w",
-        driver="GTiff",
-        width=64,
-        height=64,
-        count=1,
-        dtype="uint8",
-        crs="EPSG:32632",
-        transform=Affine(10, 0, 5e5, 0, -10, 5e6),
-    ) as file:
-        file.write(np.full((64, 64), 7, dtype=np.uint8), 1)
+    place = Affine(10, 0, 5e5, 0, -10, 5e6)
+    write_geotiff(path, np.full((64, 64), 7, dtype=np.uint8), crs="EPSG:32632", transform=place)
     return path
 
 

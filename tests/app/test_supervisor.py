@@ -4,9 +4,13 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import pytest
+
+from amers.app.cli import serve
+from amers.app.usecases import local_access
 
 PATIENCE_S = 60.0
 SUPERVISOR = """
@@ -113,3 +117,44 @@ def test_the_supervisor_imports_neither_the_server_nor_the_science():
     )
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == ""
+
+
+class Listener(nullcontext[None]):
+    """Stands for a socket that listens on an address."""
+
+    def __init__(self, host: str) -> None:
+        super().__init__()
+        self.host = host
+
+    def getsockname(self) -> tuple[str, int]:
+        return self.host, 8000
+
+    def fileno(self) -> int:
+        return 7
+
+
+@pytest.mark.parametrize(
+    ("hosts", "shown"),
+    [(["127.0.0.1"], True), (["::1", "127.0.0.5"], True), (["127.0.0.1", "192.0.2.7"], False)],
+)
+def test_the_address_that_signs_in_is_shown_where_this_machine_alone_can_reach_it(
+    hosts: list[str], shown: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The hosts are addresses that one name can have; the others must not find a session."""
+    addresses: list[str] = []
+
+    def signed_in(_: str, address: str) -> AbstractContextManager[str]:
+        addresses.append(address)
+        return nullcontext(address)
+
+    monkeypatch.setenv("AMERS_DATA_FOLDER", str(tmp_path))
+    monkeypatch.delenv("AMERS_DATABASE_URL", raising=False)
+    monkeypatch.setattr(serve, "_listeners", lambda *_: list(map(Listener, hosts)))
+    monkeypatch.setattr(serve, "ready_database", lambda _: nullcontext("a dsn"))
+    monkeypatch.setattr(serve, "database_watched", lambda _: nullcontext())
+    monkeypatch.setattr(serve.logs, "configure", lambda _: None)
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setattr(serve.Supervisor, "run", lambda *_, **__: None)
+    monkeypatch.setattr(local_access, "signed_in_address", signed_in)
+    serve.serve()
+    assert bool(addresses) == shown

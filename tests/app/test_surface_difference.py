@@ -15,6 +15,7 @@ from amers.services.formats.images.surfaces import BANDS, heights_crs
 from amers.services.map_grid import MapGrid, lon_lat_of_xy, xy_of_lon_lat
 from amers.services.types import Array
 from tests.command_line import amers_here
+from tests.geotiffs import write_geotiff
 
 UTM, NEXT_UTM = "EPSG:32631", "EPSG:32632"
 CORNER = (698_000.0, 4_792_000.0)
@@ -64,20 +65,9 @@ def write_surface(
     image[300:320, 40:80] = np.nan
     bands = np.stack([image, np.full(shape, SIGMA_M), np.full(shape, 2), np.isnan(image) * 7])
     corner_of_pixel = grid.origin_xy + [-gsd_m / 2.0, gsd_m / 2.0]
-    with rasterio.open(
-        path,
-        "w",
-        driver="GTiff",
-        height=shape[0],
-        width=shape[1],
-        count=4,
-        dtype="float32",
-        nodata=float("nan"),
-        crs=heights_crs(grid),
-        transform=from_origin(*corner_of_pixel, gsd_m, gsd_m),
-    ) as file:
-        file.write(bands.astype(np.float32))
-        file.descriptions = BANDS
+    profile = {"nodata": float("nan"), "crs": heights_crs(grid)}
+    transform = from_origin(*corner_of_pixel, gsd_m, gsd_m)
+    write_geotiff(path, bands.astype(np.float32), names=BANDS, transform=transform, **profile)
     return path
 
 

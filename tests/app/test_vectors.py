@@ -24,6 +24,7 @@ from amers.services.sensors.correction import no_correction
 from amers.services.sensors.rpc import RpcModel
 from amers.services.types import Frame
 from tests.app.test_orthorectification import MODEL, in_the_image, write_inputs
+from tests.geotiffs import write_geotiff
 
 a_millimetre = 1e-3
 a_micropixel = 1e-6
@@ -259,18 +260,10 @@ def test_features_without_ground_are_refused_by_name_or_left_out(
     lon, lat = on_ground(in_the_image(), [150], [200])[0]
     points = drawn(tmp_path / "drawn.gpkg", "POINT (5 -5)", "LINESTRING (200 -150, 390 -290)")
     small = tmp_path / "small.tif"
-    with rasterio.open(
-        small,
-        "w",
-        driver="GTiff",
-        height=3,
-        width=3,
-        count=1,
-        dtype="float32",
-        crs="EPSG:4326",
-        transform=from_origin(lon - 0.0006, lat + 0.0006, 0.0004, 0.0004),
-    ) as file:
-        file.write(np.full((3, 3), MODEL.ground_offset[2], np.float32), 1)
+    place = from_origin(lon - 0.0006, lat + 0.0006, 0.0004, 0.0004)
+    write_geotiff(
+        small, np.full((3, 3), MODEL.ground_offset[2], np.float32), crs="EPSG:4326", transform=place
+    )
     options = [*inputs[:2], "--dem", small, "--vertical", "ellipsoid", "-o", tmp_path / "map.gpkg"]
     with pytest.raises(AmersError, match=r"feature 1, vertex 1, at line 4\.5.*2 of 2 features.*--skip"):
         run("correct", points, *options)

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
 from rasterio.transform import from_origin
 
 from amers.app.db import engine
@@ -22,6 +21,7 @@ from amers.app.usecases.tokens import create_token
 from tests.app.conftest import EMPTY_TEMPLATE, TEMPLATE, fresh_database
 from tests.command_line import Done, amers_here
 from tests.factories import make_block
+from tests.geotiffs import write_geotiff
 from tests.statements import run_sql
 
 TABLES = "select relname, n_tup_ins, n_tup_upd, n_tup_del from pg_stat_user_tables"
@@ -349,18 +349,7 @@ def refusing_server() -> Iterator[int]:
 def write_map(path: Path) -> Path:
     """An image of 64 x 64 pixels on a map."""
     pixels = np.arange(64 * 64, dtype=np.uint16).reshape(1, 64, 64)
-    with rasterio.open(
-        path,
-        "w",
-        driver="GTiff",
-        height=64,
-        width=64,
-        count=1,
-        dtype="uint16",
-        crs="EPSG:32631",
-        transform=from_origin(700_000, 4_830_000, 1.0, 1.0),
-    ) as file:
-        file.write(pixels)
+    write_geotiff(path, pixels, crs="EPSG:32631", transform=from_origin(700_000, 4_830_000, 1.0, 1.0))
     return path
 
 
