@@ -1,10 +1,8 @@
 """A backup is one set of database and files: whole, verified, restored completely or to be continued."""
 
 import json
-import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,14 +11,12 @@ from amers.app.config import Settings
 from amers.app.db import engine, installation, stored_files
 from amers.app.db.cluster import backup as archive
 from amers.app.db.cluster.embedded import Cluster
-from amers.app.errors import Conflict, InputError
-from amers.app.storage import MARKER, Marker, Storage, open_storage, read_marker, trash
+from amers.app.errors import Conflict
+from amers.app.storage import MARKER, Marker, open_storage, read_marker, trash
 from amers.app.usecases import storage_identity
 from amers.app.usecases.backups import make
 from amers.app.usecases.backups.make import make_backup
 from amers.app.usecases.backups.manifest import (
-    ARCHIVE,
-    MANIFEST,
     STORAGE,
     Manifest,
     find_problems,
@@ -30,7 +26,7 @@ from amers.app.usecases.backups.restore import RESTORING, restore_backup
 from amers.app.usecases.installation import Installation
 from amers.app.worker.sweep import sweep_files
 from tests.app.conftest import EMPTY_TEMPLATE, fresh_database
-from tests.app.full_storage import Full, another, contents
+from tests.app.full_storage import Full, contents
 from tests.command_line import environment_of
 from tests.statements import run_sql
 from tests.unproven import unproven_storage
@@ -104,14 +100,6 @@ def assert_whole(settings: Settings, files: dict[str, bytes]) -> None:
             assert storage_identity.mismatch(connection, storage) is None
 
 
-def flip_a_bit(path: Path) -> None:
-    """Change one bit in the middle of a file, in a copy of its own."""
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.unlink()
-    path.write_bytes(content)
-
-
 def test_a_backup_restores_database_and_files_of_an_installation(
     full: Full, cluster: Cluster, tmp_path: Path
 ):
@@ -149,93 +137,6 @@ def test_a_backup_names_every_kind_of_stored_file_that_is_damaged(full: Full, tm
     assert find_problems(tmp_path / "backup", read_manifest(tmp_path / "backup")) == []
 
 
-@pytest.mark.parametrize("kind", ["folder"])
-def test_a_file_that_is_missing_is_named_and_the_others_are_in_the_backup(full: Full, tmp_path: Path):
-    gone, *others = sorted(placed(full))
-    unproven_storage(full.settings).delete(gone)
-    manifest = backed_up(full, tmp_path / "backup")
-    assert [(item.key, item.reason) for item in manifest.damaged] == [(gone, "missing")]
-    assert {file.path for file in manifest.files} == {ARCHIVE, *(f"{STORAGE}/{key}" for key in others)}
-
-
-def change_a_bit(folder: Path) -> str:
-    path = next((folder / STORAGE / "scenes").rglob("a.tif"))
-    flip_a_bit(path)
-    return f"{path.relative_to(folder).as_posix()}: changed"
-
-
-def change_the_dump(folder: Path) -> str:
-    flip_a_bit(folder / ARCHIVE)
-    return f"{ARCHIVE}: changed"
-
-
-def delete_a_file(folder: Path) -> str:
-    path = next((folder / STORAGE / "chips").iterdir())
-    path.unlink()
-    return f"{path.relative_to(folder).as_posix()}: missing"
-
-
-def add_a_file(folder: Path) -> str:
-    (folder / STORAGE / "scenes" / "surplus").write_bytes(b"x")
-    return f"{STORAGE}/scenes/surplus: surplus"
-
-
-def add_a_link(folder: Path) -> str:
-    (folder / "link").symlink_to("/etc")
-    return "link: surplus"
-
-
-def link_to_the_same_file(folder: Path) -> str:
-    path = next((folder / STORAGE / "scenes").rglob("a.tif"))
-    elsewhere = path.rename(folder.with_name(f"{folder.name}-elsewhere.tif"))
-    path.symlink_to(elsewhere)
-    return f"{path.relative_to(folder).as_posix()}: it is no regular file"
-
-
-def cut_a_file(folder: Path) -> str:
-    path = next((folder / STORAGE / "uploads").rglob("a.zip"))
-    path.unlink()
-    path.write_bytes(b"PK")
-    return "2 bytes found"
-
-
-CHANGES: tuple[Callable[[Path], str], ...] = (
-    change_a_bit,
-    change_the_dump,
-    delete_a_file,
-    add_a_file,
-    add_a_link,
-    link_to_the_same_file,
-    cut_a_file,
-)
-
-
-@pytest.mark.parametrize("kind", ["folder"])
-def test_a_backup_that_is_not_as_it_was_written_is_refused_and_restores_nothing(
-    full: Full, cluster: Cluster, tmp_path: Path
-):
-    backed_up(full, tmp_path / "backup")
-    with fresh_database(cluster, EMPTY_TEMPLATE) as dsn:
-        storage = Storage(tmp_path / "restored")
-        for number, change in enumerate(CHANGES):
-            copy = tmp_path / f"copy-{number}"
-            shutil.copytree(tmp_path / "backup", copy)
-            problem = change(copy)
-            (problem_found,) = find_problems(copy, read_manifest(copy))
-            assert problem in problem_found
-            with pytest.raises(InputError, match="so nothing was restored"):
-                restore_backup(dsn, storage, copy)
-        manifest = (copy / MANIFEST).read_text()
-        (copy / MANIFEST).write_text(manifest.replace('"generation": ', '"generation": 1', 1))
-        with pytest.raises(InputError, match="checksum"):
-            restore_backup(dsn, storage, copy)
-        (copy / MANIFEST).unlink()
-        checked = amers(full.settings, "db", "verify-backup", copy)
-        assert (checked.returncode, "is no backup" in checked.stderr) == (2, True), checked.stderr
-        assert not archive.has_tables(dsn)
-    assert not storage.folder.exists()
-
-
 BACKUP_STAGES = ("_copy:0", "_copy:3", "write_manifest:0", "_sync_folders:0")
 RESTORE_STAGES = (
     "amers.app.usecases.backups.restore:_restore_file:3",
@@ -270,28 +171,6 @@ def test_a_killed_restore_is_continued_by_the_next_one(full: Full, cluster: Clus
             assert_whole(settings, placed(full))
             with pytest.raises(Conflict, match="files already"):
                 restore_backup(dsn, open_storage(settings), backup)
-
-
-@pytest.mark.parametrize("kind", ["folder"])
-def test_a_restore_that_broke_off_mends_its_files_and_takes_no_other_database(
-    full: Full, cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    def broken(*_: object) -> None:
-        raise InputError("the connection broke")
-
-    backed_up(full, tmp_path / "backup")
-    with fresh_database(cluster, EMPTY_TEMPLATE) as dsn, another(cluster) as other:
-        settings = empty(full, dsn, tmp_path / "restored")
-        storage = unproven_storage(settings)
-        with monkeypatch.context() as patch:
-            patch.setattr(archive, "restore", broken)
-            with pytest.raises(InputError, match="broke"):
-                restore_backup(dsn, storage, tmp_path / "backup")
-        with pytest.raises(Conflict, match="tables already"):
-            restore_backup(other, storage, tmp_path / "backup")
-        storage.put(storage.keys("scenes")[0], [b"half of it"])
-        restore_backup(dsn, storage, tmp_path / "backup")
-        assert_whole(settings, placed(full))
 
 
 @pytest.mark.parametrize("kind", ["folder"])
