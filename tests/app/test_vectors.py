@@ -105,15 +105,8 @@ def test_other_pixel_coordinates_give_the_same_place(inputs: list[object], tmp_p
         ("corner", "POINT (100.5 50.5)"),
         ("centre", "POINT (100 50)"),
     ):
-        run(
-            "correct",
-            drawn(tmp_path / "a.gpkg", wkt),
-            *inputs,
-            "--pixels",
-            pixels,
-            "-o",
-            tmp_path / "b.fgb",
-        )
+        point = drawn(tmp_path / "a.gpkg", wkt)
+        run("correct", point, *inputs, "--pixels", pixels, "-o", tmp_path / "b.fgb")
         places.append(shapely.get_coordinates(read_layer(tmp_path / "b.fgb").geometries)[0])
     np.testing.assert_allclose(places, [places[0]] * 3, atol=a_millimetre)
 
@@ -202,19 +195,8 @@ def test_an_unregistered_scene_has_the_accuracy_that_is_given(
     inputs: list[object], tmp_path: Path
 ) -> None:
     point = drawn(tmp_path / "drawn.gpkg", "POINT (100.5 -50.5)")
-    record = run(
-        "correct",
-        point,
-        *inputs,
-        "--sigma-m",
-        4,
-        "--sigma-px",
-        0,
-        "--dem-sigma-m",
-        0,
-        "-o",
-        tmp_path / "map.gpkg",
-    )
+    sigmas = ["--sigma-m", 4, "--sigma-px", 0, "--dem-sigma-m", 0]
+    record = run("correct", point, *inputs, *sigmas, "-o", tmp_path / "map.gpkg")
     assert record["on_the_earth"]["ce90_m"] == pytest.approx(4.0 * 2.146, rel=1e-3)
 
 
@@ -344,32 +326,11 @@ def test_details_of_one_image_are_found_where_they_project_into_another(
     ).reshape(-1, 2)
     points = [f"POINT ({sample} {line})" for line, sample in line_sample]
     drawn(tmp_path / "drawn.gpkg", *points)
-    stated = run(
-        "correct",
-        tmp_path / "drawn.gpkg",
-        "--scene",
-        first,
-        *ground,
-        "--pixels",
-        "centre",
-        "--sigma-m",
-        8.5 / 2.146,
-        "--to",
-        "EPSG:4979",
-        "-o",
-        tmp_path / "map.gpkg",
-    )
-    run(
-        "project",
-        tmp_path / "map.gpkg",
-        "--scene",
-        second,
-        *ground,
-        "--pixels",
-        "centre",
-        "-o",
-        tmp_path / "raw.gpkg",
-    )
+    drawn_on, mapped, projected = (tmp_path / f"{name}.gpkg" for name in ("drawn", "map", "raw"))
+    ground += ["--pixels", "centre"]
+    accurate = ["--sigma-m", 8.5 / 2.146, "--to", "EPSG:4979"]
+    stated = run("correct", drawn_on, "--scene", first, *ground, *accurate, "-o", mapped)
+    run("project", mapped, "--scene", second, *ground, "-o", projected)
     raw = read_layer(tmp_path / "raw.gpkg")
     offsets = []
     for name, hidden, (x, y) in zip(

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import socket
 import threading
 from collections.abc import Iterator
@@ -49,7 +50,7 @@ class Place:
         settings = {"AMERS_DATABASE_URL": self.dsn, "AMERS_DATA_FOLDER": str(self.folder / "data")}
         given = {name: value.format(**self.values) for name, value in use.environment.items()}
         kept = {name: value for name, value in os.environ.items() if not name.startswith("AMERS_")}
-        words = [word.format(**self.values) for word in use.words]
+        words = [word.format(**self.values) for word in shlex.split(use.words)]
         return amers_here(words, {**kept, **settings, **given})
 
     def state(self) -> tuple[object, ...]:
@@ -75,24 +76,24 @@ class WrongUse:
     """One kind of wrong use.
 
     Attributes:
-        words: of the command.
+        words: of the command, as a shell reads them.
         sentence: a pattern for what follows `amers: `.
         status: exit status.
         environment: variables.
     """
 
-    words: tuple[str, ...]
+    words: str
     sentence: str
     status: int = 2
     environment: dict[str, str] = field(default_factory=dict)
 
 
 def database(url: str, sentence: str) -> WrongUse:
-    return WrongUse(("block", "list"), sentence, environment={"AMERS_DATABASE_URL": url})
+    return WrongUse("block list", sentence, environment={"AMERS_DATABASE_URL": url})
 
 
 def box(text: str, sentence: str) -> WrongUse:
-    return WrongUse(("points", "query", "--bbox", text, "-o", "{new}"), sentence)
+    return WrongUse(f"points query --bbox {shlex.quote(text)} -o {{new}}", sentence)
 
 
 USES: dict[str, WrongUse] = {
@@ -136,70 +137,61 @@ USES: dict[str, WrongUse] = {
     ),
     # Settings.
     "a setting with a wrong value": WrongUse(
-        ("block", "list"),
+        "block list",
         "environment: AMERS_PORT: 'no' found; .* integer.*",
         environment={"AMERS_PORT": "no"},
     ),
     "a setting that is no JSON": WrongUse(
-        ("block", "list"),
+        "block list",
         "environment: AMERS_OIDC_SCOPES: it cannot be read; expected a JSON object such as .*",
         environment={"AMERS_OIDC_SCOPES": "read"},
     ),
     "a setting with its former name": WrongUse(
-        ("block", "list"),
+        "block list",
         "environment: AMERS_QUOTA_UPLOAD_BYTES is now AMERS_QUOTA_STORAGE_BYTES; set it under this name",
         environment={"AMERS_QUOTA_UPLOAD_BYTES": "1"},
     ),
     # The words of the command.
     "an unknown group": WrongUse(
-        ("blok",), "No such command 'blok'. Did you mean 'block'.; see `amers --help`"
+        "blok", "No such command 'blok'. Did you mean 'block'.; see `amers --help`"
     ),
     "an unknown command": WrongUse(
-        ("block", "lst"), "No such command 'lst'. Did you mean 'list'.; see `amers block --help`"
+        "block lst", "No such command 'lst'. Did you mean 'list'.; see `amers block --help`"
     ),
     "an unknown option": WrongUse(
-        ("block", "list", "--jsn"), "No such option: --jsn .*--json.*; see `amers block list --help`"
+        "block list --jsn", "No such option: --jsn .*--json.*; see `amers block list --help`"
     ),
     "a word too many": WrongUse(
-        ("block", "list", "all"),
+        "block list all",
         r"Got unexpected extra argument\(s\) \(all\); see `amers block list --help`",
     ),
     "an option without its value": WrongUse(
-        ("token", "create", "x", "--scope"),
+        "token create x --scope",
         "Option '--scope' requires an argument; see `amers.* --help`",
     ),
     "several arguments missing": WrongUse(
-        ("scene", "ortho"), "SCENE, --dem and --output are missing; see `amers scene ortho --help`"
+        "scene ortho", "SCENE, --dem and --output are missing; see `amers scene ortho --help`"
     ),
     "several files missing": WrongUse(
-        (
-            "production",
-            "ortho",
-            "{folder}/a.tif",
-            "{folder}/b.tif",
-            "--dem",
-            "{folder}/c.tif",
-            "-o",
-            "{new}",
-        ),
+        "production ortho {folder}/a.tif {folder}/b.tif --dem {folder}/c.tif -o {new}",
         "--dem: path '{folder}/c.tif' does not exist; IMAGES: path '{folder}/a.tif' does not exist; "
         "IMAGES: path '{folder}/b.tif' does not exist; see `amers production ortho --help`",
     ),
     "several images missing": WrongUse(
-        ("production", "run", "--images", "{folder}/a.tif", "--images", "{folder}/b.tif", "-o", "{new}"),
+        "production run --images {folder}/a.tif --images {folder}/b.tif -o {new}",
         "--images: no file {folder}/a.tif, {folder}/b.tif; expected paths, s3://BUCKET/KEY or https://.",
     ),
     "text for a number": WrongUse(
-        ("scene", "ortho", "{map}", "--dem", "{map}", "-o", "{new}", "--gsd-m", "fine"),
+        "scene ortho {map} --dem {map} -o {new} --gsd-m fine",
         "--gsd-m: 'fine' found; input should be a valid number.*; see `amers scene ortho --help`",
     ),
     "a number out of range": WrongUse(
-        ("scene", "ortho", "{map}", "--dem", "{map}", "-o", "{new}", "--fill-px", "99"),
+        "scene ortho {map} --dem {map} -o {new} --fill-px 99",
         "--fill-px: '99' found; input should be less than or equal to 50; see `amers scene "
         "ortho --help`",
     ),
     "an unknown format": WrongUse(
-        ("points", "query", "--bbox", "5,43,6,44", "--format", "xml"),
+        "points query --bbox 5,43,6,44 --format xml",
         "--format: 'xml' is not one of 'geojson', 'csv'; see `amers points query --help`",
     ),
     # Boxes.
@@ -227,91 +219,89 @@ USES: dict[str, WrongUse] = {
     ),
     # The service.
     "a port in use": WrongUse(
-        ("serve", "--port", "{used}"),
+        "serve --port {used}",
         "port {used} of 127.0.0.1 is in use by another program: end that program, or choose a "
         "free port with "
         "--port or AMERS_PORT",
         status=4,
     ),
     "a port that cannot be": WrongUse(
-        ("serve", "--port", "99999"), "--port: '99999' found; .* 65535; see `amers serve --help`"
+        "serve --port 99999", "--port: '99999' found; .* 65535; see `amers serve --help`"
     ),
     "an address of another machine": WrongUse(
-        ("serve", "--host", "192.0.2.1", "--port", "{used}"),
+        "serve --host 192.0.2.1 --port {used}",
         "cannot listen on 192.0.2.1, port {used} .*: choose an address of this machine with --host .*",
     ),
     # Tokens.
     "a name that a valid token has": WrongUse(
-        ("token", "create", "survey office", "--scope", "read"),
+        "token create 'survey office' --scope read",
         "NAME: the valid token [0-9a-f-]+ is named 'survey office' already: choose another "
         "name, or revoke .*",
     ),
     "an unknown scope": WrongUse(
-        ("token", "create", "x", "--scope", "write"),
+        "token create x --scope write",
         "scopes: write found, one or more of read, .* expected",
     ),
     "a token of no days": WrongUse(
-        ("token", "create", "x", "--scope", "read", "--days", "0"),
+        "token create x --scope read --days 0",
         "--days: 0 found, 1 to 36500 expected",
     ),
     "a token that is not there": WrongUse(
-        ("token", "revoke", "nobody"), "no valid token nobody: `amers token list` lists names and ids"
+        "token revoke nobody", "no valid token nobody: `amers token list` lists names and ids"
     ),
     # Blocks and points.
     "a block that is not there": WrongUse(
-        ("block", "publish", "nowhere@3"),
+        "block publish nowhere@3",
         "no block nowhere@3: expected the number, ID or ID@VERSION of a block of the store",
     ),
     "a folder that is not there": WrongUse(
-        ("block", "ingest", "{new}"),
+        "block ingest {new}",
         "{new}: no such folder; expected the folder of a block with block.json",
     ),
     "a folder that is no block": WrongUse(
-        ("block", "ingest", "{empty}"), "{empty}: block.json cannot be read: .*"
+        "block ingest {empty}", "{empty}: block.json cannot be read: .*"
     ),
     "a version that the store has": WrongUse(
-        ("block", "ingest", "{block}"),
+        "block ingest {block}",
         "block calanques version 1 is already in the store; a changed block .*",
     ),
     "a priority out of range": WrongUse(
-        ("block", "prioritise", "calanques", "5000"), "PRIORITY: 5000 found, -1000 to 1000 expected"
+        "block prioritise calanques 5000", "PRIORITY: 5000 found, -1000 to 1000 expected"
     ),
     "a box without points": WrongUse(
-        ("block", "export", "--bbox", "1,1,2,2", "-o", "{new}"),
+        "block export --bbox 1,1,2,2 -o {new}",
         r"--bbox: no points are served in \[1.0, 1.0, 2.0, 2.0\]; choose a box on a published block",
     ),
     "a point that is not there": WrongUse(
-        ("points", "suspend", "7", "--because", "gone"),
+        "points suspend 7 --because gone",
         "no point 7: expected the id of a point of the store",
     ),
     # Files.
     "a folder to write into that is not there": WrongUse(
-        ("points", "query", "--bbox", "5,43,6,44", "-o", "{new}/points.geojson"),
+        "points query --bbox 5,43,6,44 -o {new}/points.geojson",
         r"--output: {new}/points.geojson cannot be written \(No such .*\); expected a file in a "
         r"folder .*",
     ),
     "a grid of a geoid that is not installed": WrongUse(
-        ("production", "ortho", "{map}", "--dem", "{map}", "--vertical", "EPSG:5720", "-o", "{new}"),
+        "production ortho {map} --dem {map} --vertical EPSG:5720 -o {new}",
         "{map}: heights in NGF-IGN69 height cannot be converted to heights above the ellipsoid.*"
         "or give the grid file of the geoid with --geoid",
     ),
     "heights without a datum": WrongUse(
-        ("production", "ortho", "{map}", "--dem", "{map}", "-o", "{new}"),
+        "production ortho {map} --dem {map} -o {new}",
         "{map}: the file does not state its vertical datum: give ellipsoid, EGM96, EGM2008 or "
         "the code of .*",
     ),
     "a backup that is none": WrongUse(
-        ("db", "verify-backup", "{empty}"), "{empty} is no backup: it has no manifest.json"
+        "db verify-backup {empty}", "{empty} is no backup: it has no manifest.json"
     ),
     # Others.
     "an unknown kind of changes": WrongUse(
-        ("audit", "--kind", "weather"), "--kind: 'weather' found, one of token, block, .* expected"
+        "audit --kind weather", "--kind: 'weather' found, one of token, block, .* expected"
     ),
-    "too many changes": WrongUse(
-        ("audit", "--limit", "5000"), "--limit: 5000 found, 1 to 1000 expected"
-    ),
+    "too many changes": WrongUse("audit --limit 5000", "--limit: 5000 found, 1 to 1000 expected"),
     "a batch that is not in the trash": WrongUse(
-        ("store", "trash", "restore", "1999"),
+        "store trash restore 1999",
         "no batch 1999 in the trash: `amers store trash list` lists them",
     ),
 }
@@ -399,7 +389,7 @@ def test_wrong_use_ends_with_one_sentence_and_changes_nothing(place, kind):
 
 
 def test_the_refusal_of_a_scene_names_the_option_that_it_needs(place, tmp_path):
-    done = place.run(WrongUse(("scene", "register", "{map}", "-o", str(tmp_path / "out")), ""))
+    done = place.run(WrongUse(f"scene register {{map}} -o {tmp_path / 'out'}", ""))
     assert "is unknown: give the horizontal accuracy of its map grid as `--sigma-m`, one" in done.stderr
     assert "`--sigma-m`" in done.stdout
     assert done.returncode == 2
