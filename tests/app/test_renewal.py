@@ -19,8 +19,7 @@ from amers.app.db import engine
 from amers.app.db.engine import Connection, Database, driver
 from amers.app.db.jobs.attempts import LostJob
 from amers.app.db.points import points_of_block
-from amers.app.db.renewal import StoredSearches, find_searches
-from amers.app.errors import Conflict
+from amers.app.db.renewal import find_searches
 from amers.app.storage import Storage
 from amers.app.usecases.blocks import lifecycle
 from amers.app.usecases.blocks.listing import list_blocks
@@ -244,21 +243,6 @@ def test_a_scene_that_is_registered_again_searches_each_point_once(
     assert stored.found.sum() == made.registration.measures.active.sum()
 
 
-def test_searches_tell_of_the_points_at_exactly_their_places() -> None:
-    """A point that an older version had elsewhere tells of none."""
-    places = np.array([[5.0, 43.0, 100.0], [5.1, 43.0, 100.0], [5.0, 43.0, 101.0]])
-    stored = StoredSearches(
-        scene=np.array([0, 0, 1, 1]),
-        lon_lat_h=places[[2, 0, 1, 0]],
-        found=np.array([False, True, False, True]),
-        days=np.array(["2024-04-10", "2024-07-20"], dtype="datetime64[D]"),
-    )
-    own = stored.of_points(places[:2])
-    assert (own.scene.tolist(), own.point.tolist()) == ([0, 1, 1], [0, 1, 0])
-    assert own.found.tolist() == [True, False, True]
-    assert own.days is stored.days
-
-
 def refused(words: list[object]) -> str:
     result = CliRunner().invoke(amers, [*map(str, words)])
     assert result.exit_code != 0, result.output
@@ -366,27 +350,6 @@ def test_an_interrupted_renewal_leaves_nothing(
     connection.commit()
     remove_unnamed_chips(connection, Bin(storage, limited=False))
     assert set(stored_files(storage)) == files_before
-
-
-def test_a_version_that_was_replaced_meanwhile_is_not_renewed(
-    scenes: Scenes,
-    published: None,
-    database: Database,
-    storage: Storage,
-    tmp_path: Path,
-) -> None:
-    registered(database, storage, scenes.year[0], tmp_path / "out")
-    with database.snapshot() as snapshot:
-        base = read_base(snapshot, "flat", "renewed")
-        one = scene_of_image(snapshot, base.block, scenes.year[0])
-    renew_block(database, storage, base, [one], tmp_path / "block")
-    with database.transaction() as transaction:
-        lifecycle.withdraw_block(transaction, "flat")
-    with (
-        pytest.raises(Conflict, match="flat@1 is no longer published"),
-        database.transaction() as transaction,
-    ):
-        stage_renewal(transaction, storage, base, tmp_path / "block")
 
 
 def test_an_administrator_renews_a_block_by_a_job(

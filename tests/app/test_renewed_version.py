@@ -12,6 +12,7 @@ from uuid import UUID
 import numpy as np
 import pytest
 
+from amers.app.db.renewal import StoredSearches
 from amers.app.errors import ComputationError, Conflict, InputError
 from amers.app.usecases.blocks import renewal, renewing_scenes
 from amers.app.usecases.blocks.renewal import Base, next_version, renew_block, stage_renewal
@@ -333,3 +334,18 @@ def test_a_scene_is_registered_on_all_points_whatever_was_asked_of_it_before(
         assert one.scene[1:] == (f"model {number}", number)  # type: ignore[index]
         assert one.searched.tolist() == [0, 3]
         assert one.found.tolist() == [number == 0, True]
+
+
+def test_searches_tell_of_the_points_at_exactly_their_places() -> None:
+    """A point that an older version had elsewhere tells of none."""
+    places = np.array([[5.0, 43.0, 100.0], [5.1, 43.0, 100.0], [5.0, 43.0, 101.0]])
+    stored = StoredSearches(
+        scene=np.array([0, 0, 1, 1]),
+        lon_lat_h=places[[2, 0, 1, 0]],
+        found=np.array([False, True, False, True]),
+        days=np.array(["2024-04-10", "2024-07-20"], dtype="datetime64[D]"),
+    )
+    own = stored.of_points(places[:2])
+    assert (own.scene.tolist(), own.point.tolist()) == ([0, 1, 1], [0, 1, 0])
+    assert own.found.tolist() == [True, False, True]
+    assert own.days is stored.days

@@ -26,6 +26,8 @@ from amers.services.map_grid import lon_lat_of_xy, xy_of_lon_lat
 from amers.services.types import Array
 from tests.open_archive import GEOID_M, write_cog, write_geoid
 
+pytestmark = pytest.mark.long
+
 UTM = "EPSG:32631"
 GSD_M = 10.0
 WEST, NORTH = 700_000.0, 4_832_000.0
