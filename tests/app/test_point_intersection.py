@@ -11,7 +11,7 @@ import pyogrio
 import pytest
 
 from amers.app.errors import InputError
-from amers.app.usecases.marks_in_images import MarkedImages
+from amers.app.usecases.marks_in_images import MarkedImages, read_image_marks
 from amers.app.usecases.point_intersection import PointIntersection, intersect_files
 from amers.services.errors import NotEnoughPoints
 from amers.services.formats.gcp.reader import StatedByCaller, read_ground_points
@@ -187,6 +187,24 @@ def test_known_ground_is_compared_and_of_it_the_check_points_alone_where_there_a
     assert every is not None
     assert every.points == 7
     assert every.rms_m[2] == pytest.approx(40.0 / np.sqrt(7.0), rel=0.1)
+
+
+def test_ground_is_that_of_the_first_file_that_states_it(folder: Path, tmp_path: Path) -> None:
+    """Of four points, one file knows the first two, another the second and the third, none the last."""
+    rng = np.random.default_rng(4)
+    ground = truth(4, rng)
+    files = []
+    for name, known in (("left", (0, 1)), ("right", (1, 2))):
+        rows = [row for row in marks(folder, ground, rng) if row[1] == name]
+        for number, row in enumerate(rows):
+            row += ground[number].tolist() if number in known else ["", "", ""]
+        files.append(table(tmp_path / f"{name}.csv", rows, "id,image,line,sample,lon,lat,height_m"))
+    for first, second in (files, files[::-1]):
+        read = read_image_marks(MarkedImages((first, second), images(folder)))
+        expected = {files[0]: [0, 0, 1, -1], files[1]: [1, 0, 0, -1]}[first]
+        assert read.file.tolist() == expected
+        np.testing.assert_allclose(read.known[:3], ground[:3], atol=1e-8)
+        assert np.isnan(read.known[3]).all()
 
 
 def register(folder: Path, covariance_px2: Array) -> None:
