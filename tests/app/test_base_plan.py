@@ -3,16 +3,24 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import shapely
 
 from amers.app.errors import InputError
+from amers.app.usecases.base import tile_points
 from amers.app.usecases.base.making import plan
 from amers.app.usecases.base.request import BaseOptions, BaseRequest, area_km2, area_of
 from amers.app.usecases.base.search import spacing_m
+from amers.app.usecases.base.tile_points import BaseTile, placed_dates
+from amers.app.usecases.base.windows import WindowReader
+from amers.services.errors import FormatError
+from amers.services.formats.addresses import NoUsableReply
 from amers.services.imagery.archives import SENTINEL_2
+from amers.services.types import no_progress
 from tests.command_line import amers_here
 
 TILE_DEG = 1.0, 1.36
@@ -154,3 +162,77 @@ def test_the_limits_of_a_region_are_its_own(box: tuple[float, float, float, floa
         return
     with pytest.raises(InputError, match=said):
         area_of(request)
+
+
+def test_the_work_stops_at_the_third_image_in_a_row_that_no_server_gives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was read and what was refused is remembered; what no server gave is asked for again."""
+    read = {"pixels": 7, "full_pixels": 100, "clear": 0.75, "valid": 1.0}
+    silence, refusal = NoUsableReply("503"), FormatError("no image")
+    replies: list[Any] = [silence, silence, read, refusal, read, silence, silence, silence]
+    asked, heard = list[int](), list[float]()
+
+    def reply(_: object, tile: Any, number: int) -> dict[str, Any]:
+        asked.append(number)
+        if isinstance(replies[number], Exception):
+            raise replies[number]
+        return dict(replies[number])
+
+    monkeypatch.setattr(WindowReader, "_read", reply)
+    found: Any = SimpleNamespace(images=[SimpleNamespace(id=f"image {k}") for k in range(9)], items=[])
+    tile: Any = None
+
+    def new() -> WindowReader:
+        heard.clear()
+        return WindowReader(
+            tmp_path, SENTINEL_2, found, BaseOptions(), lambda share, _: heard.append(share), 4
+        )
+
+    reader, taken = new(), [False, False, True, False, True, False, False]
+    assert [reader.take(tile, number) for number in range(7)] == taken
+    assert (reader.pixels, reader.full_pixels, heard) == (14, 200, [0.25, 0.5])
+    with pytest.raises(InputError, match=r"503\. 3 images in a row were not read"):
+        reader.take(tile, 7)
+    assert reader.left_out == ["503", "503", "image 3: no image", "503", "503"]
+    assert (reader.clear(2), reader.clear_of("image 4")) == (0.75, 0.75)
+    asked.clear()
+    again = new()
+    assert [again.take(tile, number) for number in range(5)] == taken[:5]
+    assert (asked, again.pixels, heard) == ([0, 1], 14, [0.25, 0.5])
+
+
+def test_images_are_taken_from_the_first_moment_of_the_day_given(tmp_path: Path) -> None:
+    items = [item(4, day, collection=kind) for day, kind in ((0, "cop-dem-glo-30"), (1, ""), (2, ""))]
+    for one, moment in zip(items[1:], ("2023-04-30T23:59:59Z", "2023-05-01T00:00:00Z"), strict=True):
+        one["collection"] = "sentinel-2-l2a"
+        one["properties"]["datetime"] = moment
+    (tmp_path / "items.json").write_text(json.dumps({"type": "FeatureCollection", "features": items}))
+    box = (5.5, 43.3, 5.6, 43.4)
+    request = BaseRequest("sentinel-2", (str(tmp_path / "items.json"),), bbox=box, since="2023-05-01")
+    _, candidates = plan(request)
+    assert [image.id for image in candidates.images] == [items[2]["id"]]
+
+
+def test_the_shifts_of_every_tile_bring_its_dates_into_one_frame(
+    catalogue: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each tile has a date that the other lacks; one image is found in no other."""
+    _, candidates = plan(BaseRequest("sentinel-2", (catalogue,), bbox=REGION))
+    a, b, c, d = list({image.date: image for image in candidates.images}.values())[:4]
+    true_m = {image.date: np.array(error) for image, error in ((a, (3, -2)), (b, (-4, 1)), (c, (2, 5)))}
+    area: Any = None
+    tiles = [BaseTile(area, [None] * len(of), of) for of in ([a, b], [b, c, d])]  # type: ignore[list-item]
+
+    def tied(tile: BaseTile, *_: object) -> tuple[BaseTile, Any]:
+        first = true_m[tile.images[0].date]
+        unknown = np.full(2, np.nan)
+        return tile, np.array([true_m.get(image.date, unknown) - first for image in tile.images])
+
+    monkeypatch.setattr(tile_points, "_tied", tied)
+    nothing: Any = None
+    placed = placed_dates(tiles, nothing, 10.0, nothing, no_progress)
+    assert placed.left_out == [f"{d.id}: too few of its details are found"]
+    assert placed.dates == sorted(true_m)
+    placed_m = [true_m[image.date] + placed.move_m(image) for image in (a, b, c)]
+    assert np.ptp(placed_m, axis=0).max() < 0.2
