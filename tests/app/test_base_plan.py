@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,11 +18,13 @@ from amers.app.usecases.base.request import BaseOptions, BaseRequest, area_km2, 
 from amers.app.usecases.base.search import spacing_m
 from amers.app.usecases.base.tile_points import BaseTile, placed_dates
 from amers.app.usecases.base.windows import WindowReader
+from amers.app.usecases.new_block import BlockIdentity, block_metadata, fewest_views
 from amers.services.errors import FormatError
 from amers.services.formats.addresses import NoUsableReply
 from amers.services.imagery.archives import SENTINEL_2
-from amers.services.types import no_progress
+from amers.services.types import Acquisition, no_progress
 from tests.command_line import amers_here
+from tests.factories import control_points, metadata
 
 TILE_DEG = 1.0, 1.36
 """Height and width of a tile of 110 km at 43 degrees; tiles overlap by a tenth."""
@@ -236,3 +239,29 @@ def test_the_shifts_of_every_tile_bring_its_dates_into_one_frame(
     assert placed.dates == sorted(true_m)
     placed_m = [true_m[image.date] + placed.move_m(image) for image in (a, b, c)]
     assert np.ptp(placed_m, axis=0).max() < 0.2
+
+
+def test_a_block_states_its_poorest_point_and_its_latest_image() -> None:
+    """Images count once, at however many samplings they show a point."""
+    points = control_points(3, np.random.default_rng(1), n_images=3)
+    shown = np.delete(np.arange(18), [7, 8, 10, 11])
+    columns = ("gsd_m", "image", "incidence_deg", "azimuth_deg", "health")
+    fewer = {name: getattr(points.views, name)[shown] for name in columns}
+    views = replace(points.views, start=np.array([0, 6, 8, 14]), **fewer)
+    assert fewest_views(points) == 3
+    assert fewest_views(replace(points, views=views)) == 1
+    stated = metadata()
+    days = [datetime(year, 7, 2, 12, tzinfo=UTC) for year in (2021, 2025, 2023)]
+    made = block_metadata(
+        BlockIdentity("valley"),
+        [*(Acquisition(f"{day:%Y}", acquired_at=day) for day in days), Acquisition("undated")],
+        points,
+        description="",
+        outline=stated.extent,
+        specification=stated.specification,
+        options={},
+        accuracy=(),
+    )
+    assert made.epoch == pytest.approx(2025.5, abs=2e-3)
+    assert made.provenance.sources == ("2021", "2025", "2023", "undated")
+    assert (made.title, made.license) == ("valley", "proprietary")
