@@ -71,7 +71,8 @@ def made(images: tuple[Path, ...], output: Path, jobs: int = 1, **options: Any) 
 
 def test_pixels_sources_and_seams_are_written(images: tuple[Path, ...], tmp_path: Path) -> None:
     mosaic = made(images, tmp_path / "m.tif", level=True)
-    assert [one["scene"] for one in mosaic.scenes] == ["scene_0", "scene_1", "scene_2"]
+    named = [(one["number"], one["scene"]) for one in mosaic.scenes]
+    assert named == [(1, "scene_0"), (2, "scene_1"), (3, "scene_2")]
     assert sum(one["share"] for one in mosaic.scenes) == pytest.approx(1.0, abs=1e-3)
     assert mosaic.seam_step is not None
     assert mosaic.seam_step["median_m"] < 0.1 * mosaic.gsd_m

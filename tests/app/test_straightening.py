@@ -137,7 +137,9 @@ def test_bands_types_and_missing_pixels_are_kept(tmp_path: Path) -> None:
             pixels[100:150, 200:260] = 7
             file.write(pixels, band)
     folder, output = registration(tmp_path / "registered", jittered()), tmp_path / "straight.tif"
-    assert run("straighten", image, "--registered", folder, "-o", output)["bands"] == 3
+    record = run("straighten", image, "--registered", folder, "-o", output)
+    assert record["bands"] == 3
+    assert record["seen"] == pytest.approx(1.0 - 50 * 60 / (300 * 400), abs=0.02)
     with rasterio.open(output) as file:
         assert (file.dtypes, file.nodata) == (("uint16",) * 3, 7.0)
         bands = file.read()
