@@ -149,6 +149,19 @@ def test_the_position_of_the_block_is_as_precise_as_the_priors_whatever_the_nois
     np.testing.assert_allclose(found_m, expected_m, rtol=0.05)
 
 
+def test_an_image_with_an_exact_model_fixes_the_block(five: list[ViewGeometry]) -> None:
+    rng = np.random.default_rng(1)
+    shift_px = np.zeros((5, 2))
+    shift_px[2:] = rng.normal(0.0, PRIOR_PX, (3, 2))
+    ties = make_ties(five, rng, 300, NOISE_PX, 0.0, shift_px)
+    prior_px = np.array([1e-3, 1e-3, 50.0, 50.0, 50.0])
+    block = adjusted(five, ties.observations, prior_px)
+    found = np.array([model.correction.parameters[:, 0] for model in block.models])  # type: ignore[attr-defined]
+    np.testing.assert_allclose(found, shift_px, atol=a_tenth_of_a_pixel)
+    error_m = difference_m(block.lon_lat_h, ties.lon_lat_h)
+    assert np.abs(error_m.mean(axis=0)).max() < 10.0 * a_centimetre
+
+
 def test_without_noise_rays_meet_and_the_ground_moves_in_one_piece(five: list[ViewGeometry]) -> None:
     rng = np.random.default_rng(2)
     shift_px = rng.normal(0.0, PRIOR_PX, (5, 2))
@@ -193,6 +206,14 @@ def test_a_few_large_residuals_do_not_make_the_precision_of_all(five: list[ViewG
     off_px = np.where(some[:, None], rng.choice([-2.5, 2.5], (len(some), 2)) * NOISE_PX, 0.0)
     longer = replace(ties.observations, line_sample=ties.observations.line_sample + off_px)
     assert adjusted(five, longer).sigma_px < 1.15 * clean.sigma_px
+
+
+def test_without_blunders_points_are_exactly_as_good_as_they_say(five: list[ViewGeometry]) -> None:
+    trial = tried(five, 100, blunders=0.0)
+    error_m, covariance = point_errors(trial)
+    assert whitened_square(error_m, covariance).mean() == pytest.approx(1.0, abs=0.15)
+    assert trial.block.sigma_px == pytest.approx(1.0, abs=0.08)
+    assert trial.block.active.mean() > 0.99
 
 
 @pytest.mark.parametrize("noise_px", [0.05, 0.2, 0.9])
@@ -251,6 +272,22 @@ def test_a_block_across_180_degrees_is_that_of_any_other_place(five: list[ViewGe
     back = there.lon_lat_h - [east_deg, 0.0, 0.0]
     back[:, 0] = (back[:, 0] + 180.0) % 360.0 - 180.0
     assert np.nanmax(np.abs(difference_m(back, here.lon_lat_h))) < a_centimetre
+
+
+def test_residuals_are_pixels_between_what_is_seen_and_where_the_models_show_the_points(
+    trials: list[Trial],
+) -> None:
+    block, seen = trials[0].block, trials[0].ties.observations
+    rows = np.flatnonzero(np.isfinite(block.lon_lat_h[seen.point, 0]))
+    shown = np.array(
+        [
+            block.models[seen.image[row]].project(block.lon_lat_h[seen.point[row]][None, :])[0]
+            for row in rows
+        ]
+    )
+    np.testing.assert_allclose(
+        block.residual_px[rows], seen.line_sample[rows] - shown, atol=a_millipixel
+    )
 
 
 def test_the_share_that_observations_tell_of_a_parameter_is_what_they_take_off_its_prior(
@@ -324,6 +361,12 @@ def test_the_observations_that_leave_are_the_wrong_ones(trials: list[Trial]) -> 
     touched = np.isin(points, points[wrong])
     assert active[wrong].mean() < 0.02  # those along their epipolar line, or small
     assert (~active[~touched]).mean() < 0.002
+
+
+def test_active_observations_hold_their_points_with_two_rays_at_least(trials: list[Trial]) -> None:
+    for trial in trials[:10]:
+        rays = np.bincount(trial.ties.observations.point[trial.block.active])
+        assert set(rays[rays > 0]).isdisjoint({1})
 
 
 def test_a_pair_meets_across_its_rays_and_keeps_its_parallax_as_the_priors_say() -> None:

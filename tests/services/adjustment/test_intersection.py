@@ -53,6 +53,21 @@ def test_errors_are_what_the_covariance_says(count: int) -> None:
     assert (np.abs(error_m.mean(axis=0)) < 4.0 * standard_error).all()
 
 
+def test_residuals_are_the_noise_less_what_the_points_took(three: list[ViewGeometry]) -> None:
+    ties = make_ties(three, np.random.default_rng(3), 2000, NOISE_PX)
+    found = intersect([g.rpc for g in three], ties.observations, 2000)
+    chi2 = (found.residual_px**2).sum() / NOISE_PX**2
+    assert chi2 / (2000 * (2 * 3 - 3)) == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_angle_is_that_between_the_flights() -> None:
+    pair = ring_of_geometries(2, incidence_deg=15.0)
+    ties = make_ties(pair, np.random.default_rng(0), 50, 0.0)
+    exact = replace(ties.observations, sigma_px=np.full(len(ties.observations), NOISE_PX))
+    found = intersect([g.rpc for g in pair], exact, 50)
+    assert np.abs(found.angle_deg - 30.0).max() < 2.0 * a_tenth_of_a_degree
+
+
 def test_the_covariance_of_a_point_of_three_rays_is_that_of_trials(three: list[ViewGeometry]) -> None:
     rng = np.random.default_rng(2)
     one = make_ties(three, rng, 1, 0.0)
@@ -81,6 +96,20 @@ def test_the_angle_of_many_rays_is_that_of_the_two_farthest_apart_in_any_order()
         np.testing.assert_allclose(
             found.angle_deg[found.rays == 4], 30.0, atol=2.0 * a_tenth_of_a_degree
         )
+
+
+def test_height_is_less_precise_at_a_narrower_angle() -> None:
+    std = []
+    for incidence in (3.0, 15.0, 30.0):
+        pair = ring_of_geometries(2, incidence)
+        ties = make_ties(pair, np.random.default_rng(0), 20, NOISE_PX)
+        found = intersect([g.rpc for g in pair], ties.observations, 20)
+        std.append(np.sqrt(found.covariance_m2[:, 2, 2]).mean())
+        # Two opposite rays of incidence i: the height is the parallax over 2 tan i.
+        assert std[-1] == pytest.approx(
+            NOISE_PX / np.sqrt(2.0) / np.tan(np.radians(incidence)), rel=0.15
+        )
+    assert std[0] > std[1] > std[2]
 
 
 def test_a_single_ray_and_two_parallel_ones_meet_nowhere(three: list[ViewGeometry]) -> None:

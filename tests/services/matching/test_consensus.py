@@ -49,6 +49,15 @@ def test_a_consensus_of_two_fifths_is_found(seed: int) -> None:
     assert consensus.false_alarms < 1e-12
 
 
+def test_random_displacements_are_not_significant() -> None:
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        assert (
+            a_contrario_consensus(random_displacements(rng, 60), TOLERANCE_M, REACH_M).false_alarms
+            > 1e-4
+        )
+
+
 @pytest.mark.parametrize("count", [5, 10, 20, 40, 60])
 def test_the_stated_false_alarms_are_not_too_small(count: int) -> None:
     stated = stated_false_alarms(count)
@@ -109,6 +118,18 @@ def test_no_choice_of_axes_order_or_unit_changes_a_consensus(apart_m: float | No
     in_feet = false_alarms(displacement, limits, place, 3.28)
     permuted = false_alarms(displacement[order], limits[order], place[order], 1.0)
     np.testing.assert_allclose([swapped, mirrored, moved, in_feet, permuted], plain, rtol=1e-6)
+
+
+def test_a_larger_consensus_is_more_significant() -> None:
+    rng = np.random.default_rng(0)
+    noise = random_displacements(rng, 30)
+    stated = []
+    for right in (0, 4, 8, 16):
+        displacement = noise.copy()
+        displacement[:right] = [10.0, -20.0] + rng.normal(0.0, NOISE_M, (right, 2))
+        stated.append(a_contrario_consensus(displacement, TOLERANCE_M, REACH_M).false_alarms)
+    assert stated[0] > 0.1
+    assert np.all(np.diff(stated) < 0.0)
 
 
 def test_missing_displacements_do_not_take_part() -> None:
@@ -197,6 +218,15 @@ def test_few_points_worse_than_declared_are_kept(count: int) -> None:
         inliers, _ = robust_affine_inliers(position, displacement, np.ones(count, dtype=bool), 2.0)
         kept.append(inliers.mean())
     assert np.mean(kept) > 0.8
+
+
+def test_points_as_good_as_declared_have_a_scale_of_one() -> None:
+    rng = np.random.default_rng(2)
+    position = rng.uniform(0.0, 700.0, (80, 2))
+    for _ in range(20):
+        measured = rng.normal(0.0, 1.0, (80, 2))
+        _, scale = robust_affine_inliers(position, measured, np.ones(80, dtype=bool), 1.0)
+        assert scale == pytest.approx(1.0, abs=0.3)
 
 
 @pytest.mark.parametrize("count", [8, 20])

@@ -101,6 +101,14 @@ def test_the_stated_sigma_is_not_too_small_under_haze(smoothness_px: float) -> N
     assert 0.4 < trials(smoothness_px, 0.45, 5.0, 4).normalised_square < 1.5
 
 
+@pytest.mark.long
+def test_the_stated_sigma_grows_with_the_noise_and_with_the_smoothness() -> None:
+    def sigma(smoothness_px: float, noise: float) -> float:
+        return float(np.median(trials(smoothness_px, noise, smoothness_px, 6).sigma_px))
+
+    assert sigma(1.5, 0.2) < sigma(1.5, 0.45) < sigma(3.0, 0.45)
+
+
 def test_brightness_and_contrast_do_not_move_a_chip() -> None:
     ground = texture(np.random.default_rng(0), PERIOD, 1.5)
     patch, chip = patch_of(moved(ground, 1.3, -2.4)), chip_of(ground)
@@ -150,6 +158,16 @@ def test_a_straight_edge_is_ambiguous() -> None:
     seen, cut = (edge + 0.02 * rng.standard_normal((side, side)) for _ in range(2))
     chip = as_pixels(cut[20 : 20 + SIDE, 20 : 20 + SIDE])
     assert find_chip(as_pixels(seen), chip, OPTIONS).reason == "ambiguous"
+
+
+def test_nodata_away_from_a_chip_does_not_move_it() -> None:
+    ground = texture(np.random.default_rng(0), PERIOD, 1.5)
+    patch = patch_of(moved(ground, -2.3, -1.6))
+    whole = find_chip(patch, chip_of(ground), OPTIONS)
+    patch[:, 110:] = np.nan
+    beside = find_chip(patch, chip_of(ground), OPTIONS)
+    assert beside.reason == FOUND
+    np.testing.assert_allclose(beside.row_col, whole.row_col, atol=a_millipixel)
 
 
 def test_the_largest_sigma_is_that_along_the_worst_direction() -> None:

@@ -105,6 +105,15 @@ def test_less_than_one_percent_missing_costs_nothing(kind: Kind, where: Where) -
     np.testing.assert_allclose(np.median(damaged.sigma_px), np.median(whole.sigma_px), rtol=0.05)
 
 
+@pytest.mark.thorough
+def test_the_stated_sigma_grows_with_what_is_missing() -> None:
+    sigma = [
+        float(np.median(trials("patches", "patch", share, 1.5, white=True).sigma_px))
+        for share in (0.0, 0.2, 0.4)
+    ]
+    assert sigma[0] < sigma[1] < sigma[2]
+
+
 def test_a_chip_is_found_to_the_same_place_whether_pixels_are_missing_or_saturated() -> None:
     rng = np.random.default_rng(0)
     ground = texture(rng, PERIOD, 1.5)

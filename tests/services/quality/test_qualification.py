@@ -78,6 +78,13 @@ def test_residuals_of_the_image_are_x_along_samples_and_y_along_lines(registered
     assert result.ground_residuals_m.horizontal.mean == 2.5
 
 
+def test_residuals_count_active_points_only(registered):
+    scene = registered()
+    residual = np.where(scene.measures.active[:, None], [0.1, 0.1], 1000.0)
+    result = qualified(replace(scene, measures=replace(scene.measures, residual_px=residual)))
+    assert result.image_residuals_px.x.mean == pytest.approx(0.1)
+
+
 def test_held_out_residuals_have_the_size_of_the_noise(registered):
     stability = qualified(registered(n=400, noise_px=0.3)).stability
     assert stability.held_out_px.x.std == pytest.approx(0.3, rel=0.1)
@@ -147,6 +154,21 @@ def test_the_predicted_accuracy_is_honest_about_the_true_correction(registered):
         inside.append(np.hypot(*error[0]) <= predicted.ce90_px[0, -1])
     three_standard_errors = 3.0 * np.sqrt(0.9 * 0.1 / 60)
     assert np.mean(inside) == pytest.approx(0.9, abs=three_standard_errors)
+
+
+def test_the_prediction_of_a_shift_is_the_same_all_over_the_image(registered):
+    scene = registered()
+    covariance = np.zeros((6, 6))
+    covariance[0, 0] = covariance[3, 3] = 0.04
+    adjustment = replace(scene.adjustment, covariance=covariance)
+    frame = Frame.from_sigmas(2.0, 2.0)
+    result = predict_accuracy(replace(scene, adjustment=adjustment, frame=frame).adjusted(), 5)
+    assert result.std_line_px == pytest.approx(np.full((5, 5), 0.2))
+    assert result.worst_px == pytest.approx(result.overall_px)
+    assert result.worst_m == pytest.approx(0.5 * 0.2 * 2.1460, rel=1e-3)
+    on_the_earth_m = np.hypot(2.0, 0.5 * 0.2) * 2.1460
+    assert result.on_the_earth_worst_m == pytest.approx(on_the_earth_m, rel=1e-3)
+    assert result.on_the_earth_overall_m == pytest.approx(on_the_earth_m, rel=1e-3)
 
 
 def test_the_prediction_grows_towards_the_edge_along_a_drift(registered):
@@ -317,6 +339,14 @@ def test_a_scene_finer_than_its_chips_is_usable_by_the_limits_of_a_scene_as_coar
     assert limits_m(2.0, "good") == limits_m(0.0, "good")
 
 
+def test_a_user_sets_a_limit_in_metres_alone(registered):
+    options = replace(DEFAULT, usable_ce90_px=0.0, usable_ce90_m=2.5)
+    scene = replace(registered().adjusted(), control_gsd_m=2.0)
+    criteria = qualify(scene, options, np.random.default_rng(3)).criteria
+    limit = next(c.limit for c in criteria if c.name == "predicted_ce90_px" and c.needed_for == "usable")
+    assert limit * GSD_M == pytest.approx(2.5)
+
+
 @pytest.mark.parametrize("gsd_m", [0.1, 0.5, 10.0])
 @pytest.mark.parametrize("needed_for", ["good", "usable"])
 @pytest.mark.parametrize("name", ["displacement", "ce90"])
@@ -378,6 +408,14 @@ def test_an_error_of_the_model_is_no_scatter_of_points(registered, stated_px):
     explained_px = min(stated_px, amplitude_px)
     unexplained = max(amplitude_px**2 - (1.0 + 2.0 * np.sqrt(2.0 / 300)) * explained_px**2, 0.0)
     assert scattered == pytest.approx(np.sqrt(unexplained), abs=0.5)
+
+
+def test_nineteen_active_points_are_never_good(registered):
+    scene = registered(n=19, lost=0, wrong=0)
+    result = qualified(scene, replace(DEFAULT, good_coverage_percent=0.0))
+    assert result.point_counts.active <= 19
+    assert ("active_points", "good") in failed(result)
+    assert result.verdict == "usable"
 
 
 def test_points_in_a_corner_are_never_good(registered):

@@ -90,6 +90,14 @@ def test_only_the_current_adjustment_counts() -> None:
     assert chosen.image_offset.tolist() == (MODEL.image_offset + [7.0, 0.0]).tolist()
 
 
+def test_a_rotation_is_refused_not_ignored() -> None:
+    text = with_value(TEXT, "adjustment_0.adj_param_4.parameter", "0.5")
+    with pytest.raises(
+        FormatError, match=r"a\.geom: .*adj_param_4 \(map_rotation\) is 0\.05, 0 expected"
+    ):
+        parse_geom(text, "a.geom")
+
+
 def whole_product(kind: str, offset: float, scale: float, count: int) -> str:
     text = with_value(TEXT, "type", kind)
     for axis, size in (("line", "number_lines"), ("samp", "number_samples")):
