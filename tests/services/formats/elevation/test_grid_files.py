@@ -233,3 +233,12 @@ def test_few_tiles_are_open_at_a_time(tmp_path: Path, monkeypatch: pytest.Monkey
     terrain = read_dem(tmp_path, "ellipsoid")
     assert np.isfinite(terrain.nodes()).all()
     assert len(terrain.heights._open) == 2
+
+
+def test_a_folder_or_a_list_without_heights_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FormatError, match=r"a folder with files of heights, .* found 0"):
+        read_dem(tmp_path / "empty", "ellipsoid")
+    (tmp_path / "list.txt").write_text("nowhere.tif\n")
+    with pytest.raises(FormatError, match=r"nowhere\.tif does not exist"):
+        read_dem(tmp_path / "list.txt", "ellipsoid")
